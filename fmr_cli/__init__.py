@@ -1,0 +1,33 @@
+"""Feature-metric point cloud registration.
+
+    from fmr_cli import align, read_cloud, write_cloud
+
+Names are loaded on first use, so that ``import fmr_cli`` and ``fmr --help`` start at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "PointCloud": "fmr_cli.cloud",
+    "FmrError": "fmr_cli.errors",
+    "read_cloud": "fmr_cli.io",
+    "write_cloud": "fmr_cli.io",
+    "read_transform": "fmr_cli.io",
+    "write_transform": "fmr_cli.io",
+    "align": "fmr_cli.registration",
+    "Registration": "fmr_cli.registration",
+    "Options": "fmr_cli.registration",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'fmr_cli' has no attribute {name!r}")

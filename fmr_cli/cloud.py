@@ -1,0 +1,78 @@
+"""A point cloud in memory: float64 points, their attributes, and what the file said about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+NORMALS = ("nx", "ny", "nz")
+
+
+@dataclass
+class PointCloud:
+    """Points with per-point attributes.
+
+    points: (N, 3) float64, in the file's own unit and frame; every coordinate finite.
+    attributes: name -> (N,) or (N, k) array in the file's own dtype. Names are unified over the formats:
+        ``red green blue alpha``, ``nx ny nz``, ``intensity``; every other field keeps the file's name.
+    path, format: where the cloud came from ("ply", "pcd", "las", "laz", "kitti", "xyz", "csv", "npy", "npz", "mesh").
+    dropped: how many points of the file were left out because a coordinate was NaN or infinite.
+    crs: the coordinate reference system as the file states it (WKT or "EPSG:n"), or None.
+    sensor_origin: (3,) float64 position of the sensor where the file states it, or None.
+    las_header: the ``laspy.LasHeader`` of a LAS/LAZ file (scales, offsets, VLRs), so that it can be written again.
+    """
+
+    points: np.ndarray
+    attributes: dict[str, np.ndarray] = field(default_factory=dict)
+    path: Path | None = None
+    format: str | None = None
+    dropped: int = 0
+    crs: str | None = None
+    sensor_origin: np.ndarray | None = None
+    las_header: Any = None
+
+    def __post_init__(self) -> None:
+        self.points = np.asarray(self.points, dtype=np.float64)
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ValueError(f"points must have shape (N, 3), not {self.points.shape}")
+        for name, values in self.attributes.items():
+            if len(values) != len(self.points):
+                raise ValueError(f"attribute {name!r} has {len(values)} values for {len(self.points)} points")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def name(self) -> str:
+        """The file's path for messages, or a placeholder for a cloud made in memory."""
+        return str(self.path) if self.path else "<cloud in memory>"
+
+    def select(self, index: np.ndarray) -> PointCloud:
+        """The points (and their attributes) at an index array or boolean mask of shape (N,)."""
+        return replace(
+            self, points=self.points[index], attributes={name: v[index] for name, v in self.attributes.items()}
+        )
+
+    def with_attribute(self, name: str, values: np.ndarray) -> PointCloud:
+        """A copy that also holds ``values`` (N,) under ``name``."""
+        return replace(self, attributes={**self.attributes, name: np.asarray(values)})
+
+    def transformed(self, T: np.ndarray) -> PointCloud:
+        """The cloud moved by T (4x4, float64, rigid or with a uniform scale): x -> R x + t; normals are rotated, not scaled."""
+        moved = replace(self, points=transform_points(T, self.points), attributes=dict(self.attributes))
+        if all(name in self.attributes for name in NORMALS):
+            rotation = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
+            normals = np.stack([self.attributes[name] for name in NORMALS], 1).astype(np.float64) @ rotation.T
+            for axis, name in enumerate(NORMALS):
+                moved.attributes[name] = normals[:, axis].astype(self.attributes[name].dtype)
+        if self.sensor_origin is not None:
+            moved.sensor_origin = transform_points(T, self.sensor_origin[None])[0]
+        return moved
+
+
+def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """R x + t for every row x of points (N, 3); T is 4x4, both float64."""
+    return points @ T[:3, :3].T + T[:3, 3]

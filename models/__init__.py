@@ -1,0 +1,1 @@
+"""Bundled weights, their cards and recipes; installed as ``fmr_cli.models``."""
