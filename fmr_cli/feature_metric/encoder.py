@@ -1,0 +1,120 @@
+"""The encoder F: a PointNet without its transform nets, and the exact Jacobian of F with respect to the pose.
+
+F(P) = max over points p of f(p), f a shared MLP 3-64-64-64-128-K (Qi et al. 2017; K = 1024 in the paper). There is no
+batch normalisation: nothing to switch between training and use, and no cloud's feature depends on its batch.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from fmr_cli.errors import ModelError
+
+HIDDEN = (64, 64, 64, 128)
+FEATURE_DIM = 1024
+
+
+class Encoder(nn.Module):
+    """f: R³ -> R^K pointwise and F, its maximum over a cloud."""
+
+    def __init__(self, feature_dim: int = FEATURE_DIM, hidden: tuple[int, ...] = HIDDEN) -> None:
+        super().__init__()
+        widths = (3, *hidden, feature_dim)
+        self.hidden, self.feature_dim = tuple(hidden), feature_dim
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+
+    def pointwise(self, points: Tensor) -> Tensor:
+        """f of every point: (..., 3) -> (..., K). The last layer is linear, so that every channel keeps a gradient."""
+        x = points
+        for layer in self.layers[:-1]:
+            x = torch.relu(layer(x))
+        return self.layers[-1](x)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """F of every cloud: (B, N, 3) -> (B, K)."""
+        return self.pointwise(points).amax(-2)
+
+    def encode(self, points: Tensor, chunk: int = 2048) -> tuple[Tensor, Tensor]:
+        """F with the critical points: (B, N, 3) -> feature (B, K), index (B, K) of the point that set each channel.
+
+        A running maximum over chunks keeps the B x N x K activation in cache; the result is that of ``forward``.
+        """
+        feature, index = self.pointwise(points[:, :chunk]).max(-2)
+        for first in range(chunk, points.shape[1], chunk):
+            value, where = self.pointwise(points[:, first : first + chunk]).max(-2)
+            better = value > feature
+            feature = torch.where(better, value, feature)
+            index = torch.where(better, where + first, index)
+        return feature, index
+
+    def critical_gradients(self, points: Tensor, index: Tensor) -> Tensor:
+        """df_k/dp at the critical point of each channel: points (B, N, 3), index (B, K) -> (B, K, 3).
+
+        Three tangents go forward through the MLP for one point a channel; the last layer takes only its own row.
+        """
+        x = points.gather(1, index[..., None].expand(-1, -1, 3))  # [B x K x 3]
+        tangent = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:2], 3, 3)  # [B x K x (d/dx_i) x width]
+        for layer in self.layers[:-1]:
+            x = layer(x)
+            tangent = (tangent @ layer.weight.T) * (x > 0)[..., None, :]
+            x = torch.relu(x)
+        return torch.einsum("bkiw,kw->bki", tangent, self.layers[-1].weight)
+
+
+def jacobian(encoder: Encoder, points: Tensor, index: Tensor) -> Tensor:
+    """J of F(exp(-xi) P) at xi = 0, exact, from the critical points: (B, N, 3), (B, K) -> (B, K, 6).
+
+    F_k depends on the one point p that sets channel k, and d(exp(-xi) p) = -(omega × p + v), so that by the chain rule
+    J_k = -(p × grad f_k, grad f_k).
+    """
+    gradient = encoder.critical_gradients(points, index)
+    p = points.gather(1, index[..., None].expand(-1, -1, 3))
+    return -torch.cat([torch.linalg.cross(p, gradient), gradient], -1)
+
+
+def save_encoder(path: Path | str, encoder: Encoder, decoder: nn.Module | None = None) -> None:
+    """Write the weights as safetensors, the architecture in its metadata; a decoder's go along for further training."""
+    from safetensors.torch import save_file
+
+    tensors = {f"encoder.{k}": v.detach().cpu().contiguous() for k, v in encoder.state_dict().items()}
+    if decoder is not None:
+        tensors |= {f"decoder.{k}": v.detach().cpu().contiguous() for k, v in decoder.state_dict().items()}
+    architecture = {"hidden": list(encoder.hidden), "feature_dim": encoder.feature_dim}
+    save_file(tensors, str(path), metadata={"architecture": json.dumps(architecture)})
+
+
+def load_encoder(path: Path | str) -> Encoder:
+    """Read an encoder written by ``save_encoder``. Raises ModelError where the file is missing or does not fit."""
+    encoder, _ = load_weights(path)
+    return encoder
+
+
+def load_weights(path: Path | str) -> tuple[Encoder, dict[str, Tensor]]:
+    """The encoder and the decoder's tensors (empty where the file holds none)."""
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise ModelError(f"{path}: no such model file; give a .safetensors file written by `fmr train`")
+    try:
+        with safe_open(str(path), "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except SafetensorError as error:
+        raise ModelError(f"{path}: not a safetensors file ({error}); give one written by `fmr train`") from None
+    try:
+        architecture = json.loads(metadata["architecture"])
+        encoder = Encoder(int(architecture["feature_dim"]), tuple(architecture["hidden"]))
+        own = {k.removeprefix("encoder."): v for k, v in tensors.items() if k.startswith("encoder.")}
+        encoder.load_state_dict(own)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise ModelError(
+            f"{path}: the weights do not fit the encoder ({reason}); use one written by `fmr train`"
+        ) from None
+    decoder = {k.removeprefix("decoder."): v for k, v in tensors.items() if k.startswith("decoder.")}
+    return encoder.eval().requires_grad_(False), decoder

@@ -1,0 +1,119 @@
+"""The inverse compositional (IC) iteration: find g that minimises ||F(P) - F(g Q)||², P the target, Q the source.
+
+    once:            J = dF(exp(-xi) P)/dxi at xi = 0                                (on the target)
+    every iteration: r = F(g Q) - F(P);  (JᵀWJ) dtheta = JᵀW r;  g <- exp(dtheta) g
+
+since F(exp(dtheta) g Q) = F(P) holds to first order where F(g Q) = F(exp(-dtheta) P) = F(P) + J dtheta. W is the identity
+in the paper; by default it is Geman-McClure's weight of each channel. A max-pooled channel is set by one point, so that
+channels whose point lies outside the overlap are outliers, and the weight switches them off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from fmr_cli.feature_metric import se3
+from fmr_cli.feature_metric.encoder import Encoder, jacobian
+
+FINITE_STEP = 0.02  # the paper's
+MAX_STEP = 1.0  # rad, and units of the normalised cloud
+SCALE_FROM, SCALE_TO = 4.0, 0.7  # the robust scale's factor over the iterations, times the mean |r|
+STOP_STEP = 1e-7  # the float32 noise floor of a normalised cloud's feature
+RANK_TOLERANCE = 1e-9  # of the largest eigenvalue of JᵀJ
+
+
+@dataclass
+class Template:
+    """What the solver keeps of the target P, computed once. feature: (B, K); J: (B, K, 6); rank: (B,) of JᵀJ."""
+
+    feature: Tensor
+    J: Tensor
+    rank: Tensor
+
+
+@dataclass
+class Solution:
+    """g: (B, 4, 4); errors: (iterations + 1, B) mean |r| before each iteration and after the last; rank: (B,) of JᵀJ.
+
+    A rank under 6 says that the target does not determine the pose (one point, a line): the undetermined directions
+    are left where they were.
+    """
+
+    g: Tensor
+    errors: Tensor
+    rank: Tensor
+
+    @property
+    def error(self) -> Tensor:
+        """(B,) the last mean |r|."""
+        return self.errors[-1]
+
+
+def make_template(encoder: Encoder, target: Tensor, method: Literal["exact", "finite"] = "exact") -> Template:
+    """F(P) and J of target (B, N, 3): "exact" through the critical points, or the paper's "finite" differences."""
+    feature, index = encoder.encode(target)
+    J = jacobian(encoder, target, index) if method == "exact" else finite_jacobian(encoder, target, feature)
+    eigenvalues = torch.linalg.eigvalsh((J.mT @ J).double())
+    rank = (eigenvalues > RANK_TOLERANCE * eigenvalues[:, -1:].clamp_min(1e-30)).sum(-1)
+    return Template(feature, J, rank)
+
+
+def finite_jacobian(encoder: Encoder, target: Tensor, feature: Tensor, step: float = FINITE_STEP) -> Tensor:
+    """J by the paper's forward difference, (F(exp(-step e_i) P) - F(P)) / step: (B, N, 3), (B, K) -> (B, K, 6)."""
+    twists = -step * torch.eye(6, dtype=target.dtype, device=target.device)
+    columns = [encoder.encode(se3.transform(se3.exp(twist), target))[0] - feature for twist in twists]
+    return torch.stack(columns, -1) / step
+
+
+def solve(
+    encoder: Encoder,
+    template: Template,
+    source: Tensor,
+    g: Tensor,
+    iterations: int = 10,
+    robust: bool = True,
+) -> Solution:
+    """Iterate from g (B, 4, 4) on source (B, N, 3); the template's batch is B, or 1 and shared by all.
+
+    Stops early once no step of the batch exceeds ``STOP_STEP``.
+    """
+    errors = []
+    g = g.clone()
+    for iteration in range(iterations):
+        r = encoder.encode(se3.transform(g, source))[0] - template.feature
+        errors.append(r.abs().mean(-1))
+        fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * iteration / max(iterations - 1, 1)
+        weight = geman_mcclure(r, fall) if robust else torch.ones_like(r)
+        step = weighted_step(template.J, weight, r)
+        g = se3.exp(step) @ g
+        if float(step.abs().max()) < STOP_STEP:
+            break
+    r = encoder.encode(se3.transform(g, source))[0] - template.feature
+    errors.append(r.abs().mean(-1))
+    return Solution(g, torch.stack(errors), template.rank.expand(len(g)))
+
+
+def geman_mcclure(r: Tensor, factor: float) -> Tensor:
+    """(s² / (s² + r²))² with s = factor times the mean |r| of each row: (..., K) -> (..., K)."""
+    s2 = (factor * r.abs().mean(-1, keepdim=True)).square().clamp_min(1e-24)
+    return (s2 / (s2 + r * r)).square()
+
+
+def weighted_step(J: Tensor, weight: Tensor, r: Tensor) -> Tensor:
+    """The capped step dtheta of (JᵀWJ) dtheta = JᵀW r: J (B or 1, K, 6), weight and r (B, K) -> (B, 6).
+
+    Solved in float64 by eigenvectors; directions that J does not see get no step, rather than a huge one.
+    """
+    WJ = weight[..., None] * J
+    A = (J.mT @ WJ).double()
+    b = (WJ.mT @ r[..., None]).double()
+    eigenvalues, V = torch.linalg.eigh(A)
+    seen = eigenvalues > RANK_TOLERANCE * eigenvalues[:, -1:].clamp_min(1e-30)
+    inverse = torch.where(seen, 1 / eigenvalues.clamp_min(1e-30), 0.0)
+    step = (V @ (inverse[..., None] * (V.mT @ b)))[..., 0]
+    size = step.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+    return (step * (MAX_STEP / size).clamp_max(1.0)).to(r.dtype)
