@@ -1,0 +1,132 @@
+"""Train the local patch encoder: InfoNCE between two scans' views of one place, on procedural scenes alone, no labels.
+
+The scenes know where both scanners stood, so every keypoint of one scan has its place in the other for free.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
+from fmr_cli.preprocess import Surface, working_scale
+from fmr_cli.training import scenes
+
+TEMPERATURE = 0.07
+APART = 3.0  # voxel edges: nearer places are not each other's negatives
+
+
+@dataclass
+class Views:
+    """Corresponding patches of one pair of scans: (n, PATCH_POINTS, CHANNELS) each, and their places (n, 3) in voxels."""
+
+    source: Tensor
+    target: Tensor
+    place: Tensor
+
+
+def scan_pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Two scans of one procedural scene from different places, in the scene's frame, as a scanner would give them."""
+    kind = rng.choice(["room", "street", "thing"], p=[0.5, 0.3, 0.2])
+    if kind == "room":
+        scene, eye = scenes.room(rng), np.array([*rng.normal(0, 0.7, 2), rng.uniform(1, 1.8)])
+        heading = rng.uniform(0, 2 * np.pi)
+        first = scenes.room_scan(scene, rng, eye, heading)
+        eye = eye + rng.normal(0, 0.5, 3) * [1, 1, 0.3]
+        second = scenes.room_scan(scene, rng, eye, heading + rng.uniform(-0.9, 0.9))
+    elif kind == "street":
+        scene, place = scenes.street(rng), np.array([rng.uniform(-40, 40), rng.uniform(-2, 2), 1.8])
+        first = scenes.street_scan(scene, rng, place)
+        second = scenes.street_scan(scene, rng, place + [rng.uniform(-20, 20), rng.uniform(-1, 1), 0])
+    else:
+        scene, towards = scenes.thing(rng), rng.normal(size=3)
+        views = int(rng.integers(1, 8))
+        first = scenes.thing_scan(scene, rng, towards, views)
+        second = scenes.thing_scan(scene, rng, towards + rng.normal(0, 0.4, 3) * np.linalg.norm(towards), views)
+    return first, second
+
+
+def degrade(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Thin a scan out, and shake it, as sensors differ."""
+    if rng.random() < 0.4:
+        points = points[rng.random(len(points)) < rng.uniform(0.1, 0.7)]
+    if rng.random() < 0.4:
+        points = points + rng.normal(0, rng.uniform(0, 0.01) * np.ptp(points, axis=0).max() / 2, points.shape)
+    return points
+
+
+def make_views(rng: np.random.Generator, count: int) -> Views | None:
+    """Up to ``count`` corresponding patches of a fresh pair, or None where the two scans hardly share a surface."""
+    pair = [degrade(p, rng) for p in scan_pair(rng)]
+    if min(map(len, pair)) < 500:
+        return None
+    scales = [working_scale(p, rng) for p in pair]
+    edge = max(max(v for v, _ in scales), max(s for _, s in scales)) * rng.uniform(0.8, 1.25)
+    turned = [Rotation.random(random_state=rng) for _ in pair]
+    source, target = (Surface(t.apply(p), edge) for t, p in zip(turned, pair, strict=True))
+    where = turned[0].apply(source.points, inverse=True)
+    distance, match = cKDTree(turned[1].apply(target.points, inverse=True)).query(where)
+    index = source.keypoints(2 * count)
+    index = index[distance[index] < 0.75 * edge]
+    if len(index) < 16:
+        return None
+    index = rng.permutation(index)[:count]
+    views = [
+        describe_patches(**{k: torch.from_numpy(v) for k, v in s.patches(i, PATCH_RADIUS, NEIGHBOURS).items()})
+        for s, i in ((source, index), (target, match[index]))
+    ]
+    return Views(*views, torch.from_numpy(where[index] / edge).float())
+
+
+def info_nce(a: Tensor, b: Tensor, place: Tensor) -> Tensor:
+    """InfoNCE of descriptors a, b (n, d) whose rows correspond; rows within APART of each other's place do not repel."""
+    logits = a @ b.T / TEMPERATURE
+    close = (torch.cdist(place, place) < APART) & ~torch.eye(len(a), dtype=torch.bool)
+    logits = logits.masked_fill(close, -1e4)
+    label = torch.arange(len(a))
+    return (torch.nn.functional.cross_entropy(logits, label) + torch.nn.functional.cross_entropy(logits.T, label)) / 2
+
+
+def train(pairs: int, steps: int, seed: int, batch: int = 4, per_pair: int = 128, log: bool = True) -> LocalEncoder:
+    """Train on ``pairs`` fresh scan pairs for ``steps`` steps of ``batch`` pairs each; Adam 1e-3 with a cosine."""
+    rng = np.random.default_rng(seed)
+    torch.manual_seed(seed)
+    start, material = time.time(), []
+    while len(material) < pairs:
+        views = make_views(rng, per_pair)
+        if views is not None:
+            material.append(views)
+            if log and len(material) % 50 == 0:
+                print(f"{len(material)} pairs, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
+    held_out, material = material[: pairs // 20], material[pairs // 20 :]
+    model = LocalEncoder()
+    optimiser = torch.optim.Adam(model.parameters(), 1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for step in range(steps):
+        loss = torch.zeros(())
+        for i in rng.choice(len(material), batch, replace=False):
+            views = material[i]
+            loss = loss + info_nce(model(views.source), model(views.target), views.place) / batch
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        if log and (step + 1) % 200 == 0:
+            rank1 = np.mean([held_out_rank1(model, v) for v in held_out])
+            said = f"step {step + 1}, loss {loss.item():.3f}, held-out rank-1 {rank1:.3f}, {time.time() - start:.0f} s"
+            print(said, file=sys.stderr, flush=True)
+    return model
+
+
+@torch.no_grad()
+def held_out_rank1(model: LocalEncoder, views: Views) -> float:
+    """How often the nearest descriptor among the other scan's is of the same place (within APART)."""
+    best = (model(views.source) @ model(views.target).T).argmax(1)
+    return float(((views.place[best] - views.place).norm(dim=1) < APART).float().mean())
