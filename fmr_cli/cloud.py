@@ -23,6 +23,8 @@ class PointCloud:
     crs: the coordinate reference system as the file states it (WKT or "EPSG:n"), or None.
     sensor_origin: (3,) float64 position of the sensor where the file states it, or None.
     las_header: the ``laspy.LasHeader`` of a LAS/LAZ file (scales, offsets, VLRs), so that it can be written again.
+    left_out: what else the file holds and is not kept ("list property 'neighbours'", "element 'edge'").
+    mesh: (vertices, faces) of the mesh whose surface was sampled, or None.
     """
 
     points: np.ndarray
@@ -33,6 +35,8 @@ class PointCloud:
     crs: str | None = None
     sensor_origin: np.ndarray | None = None
     las_header: Any = None
+    left_out: tuple[str, ...] = ()
+    mesh: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         self.points = np.asarray(self.points, dtype=np.float64)
@@ -61,11 +65,14 @@ class PointCloud:
         return replace(self, attributes={**self.attributes, name: np.asarray(values)})
 
     def transformed(self, T: np.ndarray) -> PointCloud:
-        """The cloud moved by T (4x4, float64, rigid or with a uniform scale): x -> R x + t; normals are rotated, not scaled."""
+        """The cloud moved by T (4x4, float64, rigid or with a uniform scale s): x -> s R x + t.
+
+        Normals are rotated, not scaled; the sensor's position moves along.
+        """
         moved = replace(self, points=transform_points(T, self.points), attributes=dict(self.attributes))
+        scale = np.cbrt(np.linalg.det(T[:3, :3]))
         if all(name in self.attributes for name in NORMALS):
-            rotation = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
-            normals = np.stack([self.attributes[name] for name in NORMALS], 1).astype(np.float64) @ rotation.T
+            normals = np.stack([self.attributes[name] for name in NORMALS], 1).astype(np.float64) @ T[:3, :3].T / scale
             for axis, name in enumerate(NORMALS):
                 moved.attributes[name] = normals[:, axis].astype(self.attributes[name].dtype)
         if self.sensor_origin is not None:
