@@ -6,16 +6,24 @@ Heavy imports stay inside the commands, so that `fmr --help` starts at once.
 
 from __future__ import annotations
 
+import json
+import os
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from fmr_cli import __version__
+from fmr_cli.arguments import takes_registration_options
 from fmr_cli.errors import FmrError
 
+if TYPE_CHECKING:
+    from fmr_cli.registration import Options
+
 app = typer.Typer(
-    help="Feature-metric point cloud registration: two scans in, the right transform out, or a word that it is not sure.",
+    help="Feature-metric point cloud registration: two scans in, the right transform out.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -30,6 +38,116 @@ def root(version: bool = typer.Option(False, "--version", help="Print the versio
     if version:
         typer.echo(__version__)
         raise typer.Exit
+
+
+@app.command("align")
+@takes_registration_options
+def align_command(
+    source: Annotated[Path, typer.Argument(help="The cloud that is moved.", show_default=False)],
+    target: Annotated[Path, typer.Argument(help="The cloud that it is moved onto.", show_default=False)],
+    options: Options,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="The 4x4 transform: .txt, .npy or .json. [default: to stdout]")
+    ] = None,
+    aligned: Annotated[Path | None, typer.Option(help="The moved source, with each point's residual.")] = None,
+    merged: Annotated[Path | None, typer.Option(help="Both clouds, with a source_id: 0 source, 1 target.")] = None,
+    metrics: Annotated[Path | None, typer.Option(help="Everything said about the result, as .json.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the metrics to stdout, not the matrix.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
+) -> None:
+    """Find the transform that moves SOURCE onto TARGET."""
+    from fmr_cli import io, outputs
+
+    outputs.check_outputs([
+        (out, (".txt", ".npy", ".json")), (aligned, io.WRITABLE), (merged, io.WRITABLE), (metrics, (".json",)),
+    ])  # fmt: skip
+    moving = io.read_cloud(source, attributes=bool(aligned or merged))
+    fixed = io.read_cloud(target, attributes=bool(merged))
+    from fmr_cli.registration import align  # after reading: a bad file is said at once, without waiting for torch
+
+    found = align(moving, fixed, options)
+    T, said, warnings = found.T_target_source, outputs.metrics(moving, fixed, found), [*found.warnings]
+    if aligned:
+        warnings += io.write_cloud(aligned, outputs.aligned_cloud(moving, fixed, T))
+    if merged:
+        cloud, lacking = outputs.merged_cloud(moving, fixed, T)
+        warnings += lacking + io.write_cloud(merged, cloud)
+    if metrics:
+        outputs.write_json(metrics, said)
+    if out:
+        io.write_transform(out, T)
+    if as_json:
+        typer.echo(json.dumps(said, indent=2))
+    elif not out:
+        typer.echo(io.transform_text(T), nl=False)
+    if not quiet:
+        for line in outputs.summary(moving, fixed, found):
+            say(line)
+        for warning in warnings:
+            say(f"warning: {warning}")
+    if found.status != "aligned":
+        raise typer.Exit(UNCERTAIN)
+
+
+@app.command("batch")
+@takes_registration_options
+def batch_command(
+    manifest: Annotated[
+        Path,
+        typer.Argument(help="CSV: source, target and optionally init, name; paths relative to it.", show_default=False),
+    ],
+    options: Options,
+    out: Annotated[Path, typer.Option(help="The folder for results.csv and transforms/.", show_default=False)],
+    aligned: Annotated[bool, typer.Option("--aligned", help="Write each moved source to aligned/.")] = False,
+    merged: Annotated[bool, typer.Option("--merged", help="Write both clouds of each pair to merged/.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where a stopped run has left off.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Pairs at a time. [default: one a core]", show_default=False)
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+) -> None:
+    """Register the pairs of a MANIFEST, each file read once."""
+    from collections import Counter
+
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from fmr_cli.batch import Batch
+
+    batch = Batch(manifest, out, options, aligned=aligned, merged=merged)
+    done = batch.open(resume)
+    count = Counter(row["status"] for row in done)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=err, disable=quiet or not err.is_terminal) as progress:
+        task = progress.add_task("registering", total=len(batch.pairs), completed=len(done))
+        for row in batch.run(len(done), workers or len(os.sched_getaffinity(0))):
+            count[row["status"]] += 1
+            progress.advance(task)
+            if row["status"] == "failed" and not quiet:
+                say(f"{row['source']} onto {row['target']} failed: {row['message']}")
+    bad = count["uncertain"] + count["failed"]
+    if not quiet:
+        said = ", ".join(f"{count[status]} {status}" for status in ("aligned", "uncertain", "failed"))
+        say(f"{said}: {out / 'results.csv'}")
+    if bad:
+        raise typer.Exit(UNCERTAIN)
+
+
+def say(text: str) -> None:
+    """A line for a person, on stderr."""
+    err.print(text, markup=False)
 
 
 def main() -> None:

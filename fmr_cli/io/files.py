@@ -27,6 +27,17 @@ def check_readable(path: Path) -> int:
     return size
 
 
+def check_writable(path: Path) -> None:
+    """Raises CloudFileError where the path is a folder, or its folder is missing or cannot be written to."""
+    if path.is_dir():
+        raise CloudFileError(f"{path}: is a folder, give the name of a file to write")
+    folder = path.parent
+    if not folder.is_dir():
+        raise CloudFileError(f"{path}: the output folder {folder} does not exist, create it first")
+    if not os.access(folder, os.W_OK):
+        raise CloudFileError(f"{path}: the output folder {folder} is not writable, choose another")
+
+
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside ``path`` (same suffix); renames it on success, removes it on failure.
@@ -35,16 +46,10 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     cannot be written to, and where writing fails.
     """
     path = Path(path)
-    if path.is_dir():
-        raise CloudFileError(f"{path}: is a folder, give the name of a file to write")
-    if path.exists() and not path.is_file():
+    if path.exists() and not path.is_file() and not path.is_dir():
         yield path
         return
-    folder = path.parent
-    if not folder.is_dir():
-        raise CloudFileError(f"{path}: the output folder {folder} does not exist, create it first")
-    if not os.access(folder, os.W_OK):
-        raise CloudFileError(f"{path}: the output folder {folder} is not writable, choose another")
+    check_writable(path)
     final = path.resolve()  # a symbolic link stays one
     temporary = final.with_name(f".{final.stem[:100]}.{secrets.token_hex(4)}.tmp{final.suffix}")
     try:

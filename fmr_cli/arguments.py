@@ -1,0 +1,74 @@
+"""The registration options of the command line, declared once for every command that registers."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from fmr_cli.errors import FmrError
+
+if TYPE_CHECKING:
+    from fmr_cli.registration import Options
+
+STARTS = ("auto", "search", "features", "centroid", "identity")
+
+
+def option(help: str, *names: str, panel: str = "Registration", **kwargs: Any) -> Any:
+    return typer.Option(*names, help=help, rich_help_panel=panel, **kwargs)
+
+
+def registration_options(
+    init: Annotated[str, option(f"Where to start: {', '.join(STARTS)}, or a transform file.")] = "auto",
+    voxel_size: Annotated[float | None, option("Working voxel edge. [default: from the data]", min=0.0)] = None,
+    normalize: Annotated[bool, option("Scale the clouds to the encoder's unit box.")] = True,
+    points: Annotated[int, option("Points that the global encoder sees.", min=10)] = 2048,
+    iterations: Annotated[int, option("Iterations of the solver, at most.", min=1)] = 10,
+    robust: Annotated[bool, option("Robust weights, or the paper's plain least squares.")] = True,
+    refine: Annotated[bool, option("Finish with a geometric polish.")] = True,
+    model: Annotated[Path | None, option("Encoder weights, .safetensors. [default: the bundled ones]")] = None,
+    device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the encoder runs.")] = "auto",
+    seed: Annotated[int, option("The same seed gives the same answer.", min=0)] = 0,
+) -> Options:
+    """The options as the library takes them; a transform file for ``init`` is read. Raises FmrError."""
+    from fmr_cli.registration import Options
+
+    return Options(
+        init=read_init(init), voxel_size=voxel_size, normalize=normalize, points=points, iterations=iterations,
+        robust=robust, refine=refine, model=model, device=device, seed=seed,
+    )  # fmt: skip
+
+
+def read_init(text: str, folder: Path = Path()) -> Any:
+    """The name of a start, or the matrix in a transform file (relative to ``folder``). Raises FmrError."""
+    if text in STARTS:
+        return text
+    if not (folder / text).is_file():
+        raise FmrError(f"{text}: is no start ({', '.join(STARTS)}) and no transform file, check --init")
+    from fmr_cli.io import read_transform
+
+    return read_transform(folder / text)
+
+
+def takes_registration_options(command: Callable) -> Callable:
+    """Gives a command every option of ``registration_options``; they come to it as one argument, ``options``."""
+    # Options is imported for type checkers only, since what it needs takes long to import.
+    shared, own = (
+        inspect.signature(function, eval_str=True, locals={"Options": Any})
+        for function in (registration_options, command)
+    )
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        options = registration_options(**{name: given.pop(name) for name in shared.parameters})
+        command(**given, options=options)
+
+    parameters = [p for p in own.parameters.values() if p.name != "options"]
+    keyword_only = [p.replace(kind=p.KEYWORD_ONLY) for p in shared.parameters.values()]
+    run.__signature__ = own.replace(parameters=[*parameters, *keyword_only])  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in [*parameters, *keyword_only]}
+    return run

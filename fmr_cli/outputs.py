@@ -1,0 +1,123 @@
+"""What a registration leaves behind besides its transform: moved and merged clouds, metrics as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import CloudFileError
+from fmr_cli.io.files import atomic_write, check_writable
+
+if TYPE_CHECKING:
+    from fmr_cli.registration import Registration
+
+COLOURS = ("red", "green", "blue", "alpha")
+CHUNK = 1 << 20  # points whose neighbours are looked up at a time
+
+
+def check_outputs(outputs: Iterable[tuple[Path | None, Iterable[str]]]) -> None:
+    """Each (path or None, suffixes it may have): its folder is there, its suffix known, and no path given twice.
+
+    Raises CloudFileError, so that a long computation does not end in an output that cannot be written.
+    """
+    seen = set()
+    for path, suffixes in outputs:
+        if path is None or (path.exists() and not path.is_file() and not path.is_dir()):  # a device or a pipe
+            continue
+        if path.suffix.lower() not in suffixes:
+            raise CloudFileError(f"{path}: cannot write the suffix {path.suffix!r}, use one of {' '.join(suffixes)}")
+        if path.resolve() in seen:
+            raise CloudFileError(f"{path}: is given for two outputs, choose two names")
+        seen.add(path.resolve())
+        check_writable(path)
+
+
+def aligned_cloud(source: PointCloud, target: PointCloud, T: np.ndarray) -> PointCloud:
+    """The source moved by T, with all its attributes and ``residual``: the distance to the nearest target point."""
+    from scipy.spatial import cKDTree
+
+    moved = source.transformed(T)
+    moved.crs = target.crs or source.crs
+    origin = target.points.mean(0)
+    tree = cKDTree(target.points - origin)
+    residual = np.empty(len(moved), np.float32)
+    for start in range(0, len(moved), CHUNK):
+        part = slice(start, start + CHUNK)
+        residual[part] = tree.query(moved.points[part] - origin, workers=-1)[0]
+    return moved.with_attribute("residual", residual)
+
+
+def merged_cloud(source: PointCloud, target: PointCloud, T: np.ndarray) -> tuple[PointCloud, list[str]]:
+    """Both clouds in the target's frame with ``source_id`` (0 source, 1 target), and warnings about attributes.
+
+    An attribute that only one of them has is 0 for the other's points; one of two widths is left out.
+    """
+    clouds = (source.transformed(T), target)
+    attributes, warnings = {}, []
+    for name in dict.fromkeys([*clouds[0].attributes, *target.attributes]):
+        present = [cloud.attributes[name] for cloud in clouds if name in cloud.attributes]
+        if len({values.shape[1:] for values in present}) > 1:
+            warnings.append(f"attribute {name!r} has a different width in the two clouds: left out of the merged cloud")
+            continue
+        parts = [
+            cloud.attributes[name] if name in cloud.attributes else np.zeros((len(cloud), *present[0].shape[1:]), "u1")
+            for cloud in clouds
+        ]
+        if name in COLOURS and {values.dtype for values in present} == {np.dtype(np.uint8), np.dtype(np.uint16)}:
+            parts = [part.astype(np.uint16) * 257 if part.dtype == np.uint8 else part for part in parts]
+        attributes[name] = np.concatenate([part.astype(np.result_type(*present), copy=False) for part in parts])
+        if len(present) == 1:
+            lacking = next(cloud for cloud in (source, target) if name not in cloud.attributes)
+            warnings.append(f"attribute {name!r} is not in {lacking.name}: 0 for its points in the merged cloud")
+    attributes["source_id"] = np.repeat(np.array([0, 1], np.uint8), [len(source), len(target)])
+    points = np.concatenate([cloud.points for cloud in clouds])
+    return replace(
+        target, points=points, attributes=attributes, sensor_origin=None,
+        crs=target.crs or source.crs, las_header=target.las_header or source.las_header,
+    ), warnings  # fmt: skip
+
+
+def metrics(source: PointCloud, target: PointCloud, found: Registration) -> dict[str, Any]:
+    """Everything said about a registration, with the files it is about; plain JSON types."""
+    files = {
+        role: {"file": cloud.name, "points": len(cloud), "dropped": cloud.dropped}
+        for role, cloud in (("source", source), ("target", target))
+    }
+    return plain({**files, **found.to_dict()})
+
+
+def summary(source: PointCloud, target: PointCloud, found: Registration) -> list[str]:
+    """One line for a person, and one for each thing that should not go unnoticed."""
+    lines = [
+        f"{found.status} (confidence {found.confidence:.2f}): rotation {found.angle:.4g} deg, shift {found.shift:.6g}, "
+        f"overlap {found.overlap:.0%}, RMSE {found.inlier_rmse:.3g}, {found.seconds['total']:.2f} s"
+    ]
+    for cloud in (source, target):
+        if cloud.dropped:
+            lines.append(f"{cloud.name}: {cloud.dropped} points without finite coordinates are left out")
+    return lines
+
+
+def plain(value: Any) -> Any:
+    """The value in JSON's types; what is not finite becomes None, since JSON has no word for it."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def write_json(path: Path, value: Any) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=2) + "\n")
