@@ -30,7 +30,7 @@ app = typer.Typer(
 )
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
-UNCERTAIN = 3
+BAD_INPUT, UNCERTAIN = 2, 3
 
 
 @app.callback(invoke_without_command=True)
@@ -145,9 +145,57 @@ def batch_command(
         raise typer.Exit(UNCERTAIN)
 
 
+@app.command("info")
+def info_command(
+    files: Annotated[list[Path], typer.Argument(help="Clouds or meshes.", show_default=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON array, one object a file.")] = False,
+) -> None:
+    """Say what is in each of the FILES."""
+    from fmr_cli import io
+    from fmr_cli.io.describe import describe, table
+
+    found = []
+    for path in files:
+        try:
+            found.append(describe(io.read_cloud(path)))
+        except FmrError as error:
+            complain(error)
+            continue
+        if not as_json:
+            typer.echo(table(found[-1]))
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    if len(found) < len(files):
+        raise typer.Exit(BAD_INPUT)
+
+
+@app.command("transform")
+def transform_command(
+    file: Annotated[Path, typer.Argument(help="The cloud (or mesh) to move.", show_default=False)],
+    transform: Annotated[Path, typer.Argument(help="The 4x4 transform: .txt, .npy or .json.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The moved cloud; the suffix says the format.")],
+    inverse: Annotated[bool, typer.Option("--inverse", help="Apply the inverse of the transform.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No warnings.")] = False,
+) -> None:
+    """Move FILE by a saved TRANSFORM and write it in any format."""
+    import numpy as np
+
+    from fmr_cli import io
+
+    T = io.read_transform(transform)
+    warnings = io.write_cloud(out, io.read_cloud(file).transformed(np.linalg.inv(T) if inverse else T))
+    for warning in [] if quiet else warnings:
+        say(f"warning: {warning}")
+
+
 def say(text: str) -> None:
     """A line for a person, on stderr."""
     err.print(text, markup=False)
+
+
+def complain(error: Exception) -> None:
+    """The one line that says what is wrong, on stderr."""
+    err.print(f"fmr: {' '.join(str(error).split())}", style="red", markup=False)
 
 
 def main() -> None:
@@ -155,8 +203,8 @@ def main() -> None:
     try:
         app()
     except (FmrError, OSError) as error:
-        err.print(f"fmr: {' '.join(str(error).split())}", style="red", markup=False)
-        sys.exit(2)
+        complain(error)
+        sys.exit(BAD_INPUT)
 
 
 if __name__ == "__main__":

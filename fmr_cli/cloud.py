@@ -75,6 +75,9 @@ class PointCloud:
             normals = np.stack([self.attributes[name] for name in NORMALS], 1).astype(np.float64) @ T[:3, :3].T / scale
             for axis, name in enumerate(NORMALS):
                 moved.attributes[name] = normals[:, axis].astype(self.attributes[name].dtype)
+        if self.las_header is not None and abs(scale - 1) > 1e-6:
+            moved.las_header = self.las_header.copy()
+            moved.las_header.scales = self.las_header.scales * scale  # as many steps across the cloud as before
         if self.sensor_origin is not None:
             moved.sensor_origin = transform_points(T, self.sensor_origin[None])[0]
         return moved

@@ -7,7 +7,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from fmr_cli.cloud import PointCloud
+from fmr_cli.cloud import NORMALS, PointCloud
 from fmr_cli.errors import CloudFileError
 
 ALIASES = {
@@ -100,6 +100,48 @@ def storable(values: np.ndarray, long_integers: bool) -> np.ndarray:
     return values
 
 
+def bare_cloud(rows: np.ndarray, attributes: bool) -> PointCloud:
+    """A cloud of (N, 3 + k) numbers without names; what the further columns are is told by their values."""
+    if rows.ndim != 2 or rows.shape[1] < 3 or rows.dtype.kind not in "biuf":
+        raise CloudFileError(f"holds an array of {rows.shape} {rows.dtype}, points need (N, 3) numbers or more columns")
+    extra = rows[:, 3:]
+    with np.errstate(all="ignore"):
+        last = extra[:, -3:]
+        are_colors = bool(((last >= 0) & (last <= 255) & (last == np.rint(last))).all())
+        are_normals = bool((np.abs(np.linalg.norm(last, axis=1) - 1) < 0.01).all())
+    match extra.shape[1]:
+        case 1:
+            names: tuple[str, ...] = ("intensity",)
+        case 3 if are_colors:
+            names = COLORS
+        case 3 if are_normals:
+            names = NORMALS
+        case 4 if are_colors:
+            names = ("intensity", *COLORS)
+        case k:
+            names = tuple(f"column_{4 + i}" for i in range(k))
+    kept = {name: native(extra[:, i]) for i, name in enumerate(names)} if attributes else {}
+    return PointCloud(rows[:, :3].astype(np.float64), narrow_colors(kept))
+
+
+def narrow_colors(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Colours that text or plain arrays hold as integers from 0 to 255 (or 65535) in their usual type."""
+    present = [name for name in (*COLORS, "alpha") if name in attributes]
+    values = [attributes[name] for name in present]
+    if not present or not all(((v >= 0) & (v <= 65535) & (v == np.rint(v))).all() for v in values):
+        return attributes
+    kind = np.uint8 if max(v.max(initial=0) for v in values) <= 255 else np.uint16
+    return {**attributes, **{name: attributes[name].astype(kind) for name in present}}
+
+
+def lost_context(cloud: PointCloud, suffix: str) -> list[str]:
+    """Warnings of a format that has no place for the CRS and the sensor's position."""
+    warnings = [f"{suffix} cannot hold the coordinate reference system: left out"] if cloud.crs else []
+    if cloud.sensor_origin is not None and cloud.sensor_origin.any():
+        warnings.append(f"{suffix} cannot hold the sensor's position: left out")
+    return warnings
+
+
 def eight_bit_colors(attributes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """16-bit colours that are 8-bit ones scaled by 257 (as LAS wants them) become 8-bit; everything else stays."""
     result = dict(attributes)
@@ -136,7 +178,13 @@ class Lines:
         return self.last
 
 
-def read_table(lines: Lines, dtype: np.dtype, rows: int | None = None, delimiter: str | None = None) -> np.ndarray:
+def read_table(
+    lines: Lines,
+    dtype: np.dtype,
+    rows: int | None = None,
+    delimiter: str | None = None,
+    comments: str | None = None,
+) -> np.ndarray:
     """Parses ``rows`` lines of numbers (all, if None) into records of the flat ``dtype``, blank lines left out.
 
     Raises CloudFileError with the line's number where one does not fit, and where there are too few. The caller has
@@ -148,7 +196,7 @@ def read_table(lines: Lines, dtype: np.dtype, rows: int | None = None, delimiter
     if rows == 0:
         return np.empty(0, dtype)
     try:
-        table = np.loadtxt(lines, wide, comments=None, delimiter=delimiter, max_rows=rows, ndmin=1)
+        table = np.loadtxt(lines, wide, comments=comments, delimiter=delimiter, max_rows=rows, ndmin=1)
     except ValueError:
         text = lines.last.strip()[:60]
         raise CloudFileError(f"line {lines.number}: expected {len(names)} numbers, found {text!r}") from None

@@ -8,6 +8,7 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
+from fmr_cli.io.fields import lost_context
 
 
 def read(path: Path, attributes: bool) -> PointCloud:
@@ -39,9 +40,5 @@ def write(path: Path, cloud: PointCloud) -> list[str]:
     lost = [name for name in cloud.attributes if name != "intensity"]
     if lost:
         warnings.append(f".bin cannot hold the attributes {', '.join(lost)}: left out")
-    if cloud.sensor_origin is not None and cloud.sensor_origin.any():
-        warnings.append(".bin cannot hold the sensor's position, readers take the origin")
-    if cloud.crs:
-        warnings.append(".bin cannot hold the coordinate reference system: left out")
     rows.tofile(path)
-    return warnings
+    return warnings + lost_context(cloud, ".bin")

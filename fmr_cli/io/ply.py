@@ -113,7 +113,10 @@ def read(path: Path, attributes: bool) -> PointCloud | Mesh:
 def read_header(file: BinaryIO) -> Header:
     if file.readline(10).strip() != b"ply":
         raise CloudFileError("is not a PLY file (its first line is not 'ply')")
-    order, elements, comments, number = None, [], {}, 1
+    order = None
+    elements: list[Element] = []
+    comments: dict[str, str] = {}
+    number = 1
     while True:
         raw = file.readline(LONGEST_HEADER)
         number += 1

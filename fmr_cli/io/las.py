@@ -1,0 +1,300 @@
+"""LAS and LAZ 1.0 to 1.4, every point format, extra bytes; the header (VLRs, CRS, scales) goes along to the output."""
+
+from __future__ import annotations
+
+import io
+import logging
+import struct
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
+
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import CloudFileError
+from fmr_cli.io.fields import CHUNK, COLORS, lost_context, unique
+
+logging.getLogger("laspy").addHandler(logging.NullHandler())  # its errors come as exceptions; no second line on stderr
+
+WITH_COLORS = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}  # the point format that adds red, green and blue
+LARGEST = 2**31 - 1
+PROJECTED, GEOGRAPHIC, USER_DEFINED = 3072, 2048, 32767  # GeoTIFF keys, and their value for "not in EPSG"
+XYZ = laspy.DecompressionSelection.xy_returns_channel().decompress_z()
+
+
+class ClippedFile(io.BufferedReader):
+    """A file whose read never allocates more than is left in it, whatever length a damaged header asks for."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self.size = path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(self.size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def read(path: Path, attributes: bool) -> PointCloud:
+    """All points, a chunk at a time, so that a file of any size needs little more memory than its cloud."""
+    check_header(path)
+    selection = laspy.DecompressionSelection.all() if attributes else XYZ
+    try:
+        with laspy.open(ClippedFile(path), decompression_selection=selection) as reader:
+            header = reader.header
+            dimensions = header.point_format.dimensions
+            # Extra bytes may be called as another dimension is; numpy and laspy tell them apart by name only.
+            for k, name in enumerate(unique([d.name for d in dimensions])):
+                dimensions[k] = dimensions[k]._replace(name=name)
+            names = [d.name for d in dimensions if d.name not in "XYZ"] if attributes else []
+            points: list[np.ndarray] = []
+            columns: dict[str, list[np.ndarray]] = {name: [] for name in names}
+            for chunk in reader.chunk_iterator(CHUNK):
+                points.append(np.stack([chunk[axis] for axis in "XYZ"], 1) * header.scales + header.offsets)
+                for name in names:
+                    columns[name].append(np.array(chunk[name]))
+            count = sum(map(len, points))
+            if count != header.point_count:
+                raise CloudFileError(f"promises {header.point_count} points and holds {count}: copy it again")
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # what lazrs raises on some damaged files is no Exception
+            raise
+        raise CloudFileError("has damaged compressed data: copy it again") from error
+    if not points:
+        raise CloudFileError("holds no points (its header says 0), check how it was written")
+    kept = {name: joined(columns.pop(name)) for name in names}
+    # What `write` could not put into the 16 bits of LAS's own intensity
+    if "Intensity" in kept and not kept["intensity"].any() and kept["Intensity"].ndim == 1:
+        kept["intensity"] = kept.pop("Intensity")
+    waveform = header.global_encoding.waveform_data_packets_internal
+    left_out = ("waveform packets",) if waveform else ()
+    return PointCloud(joined(points), kept, crs=crs_of(header), las_header=header, left_out=left_out)
+
+
+def check_header(path: Path) -> None:
+    """Whether what the header promises can be in a file of this size, before anything is allocated for it."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(375)
+        if len(head) < 227 or head[:4] != b"LASF":
+            raise CloudFileError("is not a LAS file, or truncated within its header")
+        minor = head[25]
+        header_size, start, vlrs, point_format, point_size, count = struct.unpack_from("<HIIBHI", head, 94)
+        first_evlr, evlrs = 0, 0
+        if minor >= 4:
+            if len(head) < 375:
+                raise CloudFileError("is truncated within its header: copy it again")
+            first_evlr, evlrs, count = struct.unpack_from("<QIQ", head, 235)
+        if head[24] != 1 or start > size or header_size + 54 * vlrs > start or first_evlr + 60 * evlrs > size:
+            raise CloudFileError("has a damaged header, or is truncated: copy it again")
+        if point_format < 128:
+            if start + count * point_size > size:
+                holds = (size - start) // max(point_size, 1)
+                raise CloudFileError(f"promises {count} points and holds {holds}, it is truncated: copy it again")
+        elif count:
+            check_chunks(file, size, start, count, point_size)
+
+
+def check_chunks(file: io.BufferedReader, size: int, start: int, count: int, point_size: int) -> None:
+    """LAZ: the table of chunks must be there, and the chunks large enough for all points."""
+    file.seek(start)
+    table = int.from_bytes(file.read(8), "little", signed=True)
+    if table == -1:  # written to a pipe: the place is in the last bytes of the file
+        file.seek(size - 8)
+        table = int.from_bytes(file.read(8), "little", signed=True)
+    file.seek(max(min(table, size), 0))
+    words = file.read(8)
+    if not start + 8 <= table <= size - 8 or len(words) < 8:
+        raise CloudFileError("lacks the table of its compressed chunks, it is truncated: copy it again")
+    chunks = int.from_bytes(words[4:], "little")
+    if chunks * point_size > table - start or chunks > count or chunks == 0:
+        raise CloudFileError("has a damaged table of compressed chunks: copy it again")
+
+
+def joined(parts: list[np.ndarray]) -> np.ndarray:
+    """The parts as one array; each is freed as soon as it is copied."""
+    whole = np.empty((sum(map(len, parts)), *parts[0].shape[1:]), parts[0].dtype)
+    end = len(whole)
+    while parts:
+        part = parts.pop()
+        whole[end - len(part) : end] = part
+        end -= len(part)
+    return whole
+
+
+def crs_of(header: laspy.LasHeader) -> str | None:
+    """The WKT of the header, or "EPSG:n" from its GeoTIFF keys, or None."""
+    records = [*header.vlrs, *(header.evlrs or [])]
+    for record in records:
+        if isinstance(record, WktCoordinateSystemVlr) and record.string.strip("\0 \n"):
+            return record.string.strip("\0 \n")
+    for record in records:
+        if isinstance(record, GeoKeyDirectoryVlr):
+            keys = {key.id: key.value_offset for key in record.geo_keys}
+            for key in (PROJECTED, GEOGRAPHIC):
+                if 0 < keys.get(key, 0) < USER_DEFINED:
+                    return f"EPSG:{keys[key]}"
+    return None
+
+
+def write(path: Path, cloud: PointCloud) -> list[str]:
+    """LAS or LAZ by the suffix; keeps the cloud's LAS header where it has one, else makes a 1.4 header."""
+    header, warnings = header_for(cloud)
+    columns = place_attributes(header, cloud, warnings)
+    header.scales, header.offsets = scaling(cloud, warnings)
+    with laspy.open(path, "w", header=header, do_compress=path.suffix.lower() == ".laz") as writer:
+        for start in range(0, len(cloud), CHUNK):
+            part = slice(start, start + CHUNK)
+            points = cloud.points[part]
+            record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+            counts = np.rint((points - header.offsets) / header.scales)
+            for i, axis in enumerate("XYZ"):
+                record[axis] = counts[:, i].astype(np.int32)
+            for name, values in columns.items():
+                record[name][:] = values[part]
+            writer.write_points(record)
+        if header.evlrs and header.version.minor >= 4:
+            writer.write_evlrs(header.evlrs)
+    return warnings + [w for w in lost_context(cloud, path.suffix) if "sensor" in w]
+
+
+def header_for(cloud: PointCloud) -> tuple[laspy.LasHeader, list[str]]:
+    """A header of our own: a copy of the file's, or a new one with what the cloud needs."""
+    warnings = []
+    if cloud.las_header is None:
+        header = laspy.LasHeader(version="1.4", point_format=6)
+        header.generating_software = "fmr"
+    else:
+        header = cloud.las_header.copy()
+        if header.version.minor < 2:  # laspy writes 1.1 and later; 1.2 is the same with colours
+            header.version = laspy.header.Version(1, 2)
+        if header.global_encoding.waveform_data_packets_internal:
+            warnings.append("the waveform packets are left out")
+            header.global_encoding.value &= ~0b110
+            header.start_of_waveform_data_packet_record = 0
+            header.evlrs = header.evlrs and laspy.vlrs.vlrlist.VLRList(v for v in header.evlrs if v.record_id != 65535)
+    if cloud.crs != crs_of(header):
+        for records in (header.vlrs, header.evlrs or []):
+            records[:] = [r for r in records if r.user_id != "LASF_Projection"]
+        if cloud.crs:
+            header.vlrs.append(crs_record(cloud.crs))
+        header.global_encoding.wkt = bool(cloud.crs) and not str(cloud.crs).startswith("EPSG:")
+    colors = [cloud.attributes.get(color) for color in COLORS]
+    if header.point_format.id in WITH_COLORS and all(c is not None and fits(c, 0, 65535) for c in colors):
+        old = header.point_format
+        new = laspy.PointFormat(WITH_COLORS[old.id])
+        new.dimensions += old.extra_dimensions
+        version = max(header.version, laspy.LasHeader(point_format=new.id).version)
+        header.set_version_and_point_format(version, new)
+    return header, warnings
+
+
+def crs_record(crs: str) -> Any:
+    if not crs.startswith("EPSG:"):
+        return WktCoordinateSystemVlr(crs)
+    code = int(crs[5:])
+    key, model = (GEOGRAPHIC, 2) if 4000 <= code < 5000 else (PROJECTED, 1)
+    keys = struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, model, key, 0, 1, code)
+    return laspy.VLR("LASF_Projection", 34735, "GeoTiff GeoKeyDirectoryTag", keys)
+
+
+def place_attributes(header: laspy.LasHeader, cloud: PointCloud, warnings: list[str]) -> dict[str, np.ndarray]:
+    """Finds each attribute a dimension: LAS's own where it holds the values exactly, else extra bytes of their type."""
+    own = {d.name: d for d in header.point_format.standard_dimensions if d.name not in "XYZ"}
+    declared = {d.name: d for d in header.point_format.extra_dimensions}
+    columns: dict[str, np.ndarray] = {}
+    extra: dict[str, np.ndarray] = {}
+    for name, values in split(cloud.attributes, warnings).items():
+        if name in COLORS and name in own and values.dtype == np.uint8:
+            columns[name] = values.astype(np.uint16) * 257  # LAS asks for colours that fill 16 bits
+        elif name == "intensity" and "Intensity" in declared and "Intensity" not in cloud.attributes:
+            extra["Intensity"] = values
+        elif name in own and fits(values, own[name].min, own[name].max, own[name].kind.letter() == "f"):
+            columns[name] = values
+        else:
+            extra[name.capitalize() if name in own else name] = values
+    if cloud.las_header is None and "return_number" not in columns and "number_of_returns" not in columns:
+        columns |= {name: np.ones(len(cloud), np.uint8) for name in ("return_number", "number_of_returns")}
+    stale = [n for n, d in declared.items() if n not in extra or not (d.is_scaled or same_type(d, extra[n]))]
+    header.remove_extra_dims(stale)
+    taken = [d.name for d in header.point_format.dimensions]
+    for name, values in extra.items():
+        if name in taken and name in declared and name not in stale:
+            columns[name] = values
+            continue
+        short = unique([*taken, name.encode()[:30].decode(errors="ignore")])[-1]
+        if short != name.capitalize() and short != name:
+            warnings.append(f"attribute {name!r} is written as {short!r}, LAS names have at most 32 bytes")
+        kind = values.dtype.newbyteorder("<").str[1:]
+        header.add_extra_dim(laspy.ExtraBytesParams(short, f"{values.shape[1]}{kind}" if values.ndim == 2 else kind))
+        taken.append(short)
+        columns[short] = values
+    return columns
+
+
+def split(attributes: dict[str, np.ndarray], warnings: list[str]) -> dict[str, np.ndarray]:
+    """Attributes in types that LAS knows; (N, k) ones with k > 3 become k of their own."""
+    result: dict[str, np.ndarray] = {}
+    for name, values in attributes.items():
+        if values.dtype.kind not in "biuf":
+            warnings.append(f"attribute {name!r} is not numeric: left out")
+            continue
+        if values.dtype.kind == "b":
+            values = values.astype(np.uint8)
+        elif values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
+            values = values.astype(np.float32 if values.dtype.itemsize < 4 else np.float64)
+        if values.ndim > 1:
+            values = values.reshape(len(values), int(np.prod(values.shape[1:])))
+            if values.shape[1] == 1:
+                values = values[:, 0]
+            elif values.shape[1] > 3 and values.dtype != np.uint8:
+                result |= {f"{name}_{k}": values[:, k] for k in range(values.shape[1])}
+                warnings.append(f"attribute {name!r} is written as {name}_0 to {name}_{values.shape[1] - 1}")
+                continue
+        result[name] = values
+    return result
+
+
+def fits(values: np.ndarray, low: float, high: float, fraction: bool = False) -> bool:
+    """Whether (N,) values are within the limits and, without ``fraction``, integers."""
+    if values.ndim != 1 or values.dtype.kind not in "iuf":
+        return False
+    return fraction or bool(((values >= low) & (values <= high) & (values == np.rint(values))).all())
+
+
+def same_type(dimension: Any, values: np.ndarray) -> bool:
+    kind = np.dtype(dimension.type_str())
+    return kind.base == values.dtype and kind.shape == values.shape[1:]
+
+
+def scaling(cloud: PointCloud, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Scales and offsets (3,) for which no coordinate leaves int32.
+
+    The file's own scales stay unless the extent is too large for them, its offsets unless a point is too far away.
+    Without a LAS header the scale is the power of ten that cuts the extent into 10⁸ to 10⁹ steps.
+    """
+    low, high = cloud.points.min(0), cloud.points.max(0)
+    if np.abs(cloud.points).max() > 1e100:
+        raise CloudFileError("coordinates beyond 1e100 do not fit into LAS, write .ply")
+    extent = max(float((high - low).max()), float(np.abs(cloud.points).max()) * 1e-9, 1e-100)
+    own = cloud.las_header is not None and bool((cloud.las_header.scales > 0).all())
+    if not own or not np.isfinite([cloud.las_header.scales, cloud.las_header.offsets]).all():
+        scales = np.full(3, 10.0 ** (np.floor(np.log10(extent)) - 8))
+        offsets = np.rint((low + high) / 2 / scales) * scales
+        return scales, offsets
+    scales, offsets = np.array(cloud.las_header.scales), np.array(cloud.las_header.offsets)
+    for i in range(3):
+        if reach(low[i], high[i], offsets[i]) / scales[i] < LARGEST:
+            continue
+        middle = (low[i] + high[i]) / 2
+        while reach(low[i], high[i], middle) / scales[i] >= LARGEST - 1:
+            scales[i] *= 10
+        offsets[i] = np.rint(middle / scales[i]) * scales[i]
+        if scales[i] != cloud.las_header.scales[i]:
+            warnings.append(f"{'xyz'[i]} spans too much for LAS at the file's scale, it is now {scales[i]:g}")
+    return scales, offsets
+
+
+def reach(low: float, high: float, offset: float) -> float:
+    return max(abs(low - offset), abs(high - offset))
