@@ -6,14 +6,11 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from fmr_cli.errors import FmrError
-
-if TYPE_CHECKING:
-    from fmr_cli.registration import Options
 
 STARTS = ("auto", "search", "features", "centroid", "identity")
 
@@ -33,14 +30,15 @@ def registration_options(
     model: Annotated[Path | None, option("Encoder weights, .safetensors. [default: the bundled ones]")] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the encoder runs.")] = "auto",
     seed: Annotated[int, option("The same seed gives the same answer.", min=0)] = 0,
-) -> Options:
-    """The options as the library takes them; a transform file for ``init`` is read. Raises FmrError."""
-    from fmr_cli.registration import Options
+) -> dict[str, Any]:
+    """What ``fmr_cli.Options`` takes; a transform file for ``init`` is read. Raises FmrError.
 
-    return Options(
-        init=read_init(init), voxel_size=voxel_size, normalize=normalize, points=points, iterations=iterations,
-        robust=robust, refine=refine, model=model, device=device, seed=seed,
-    )  # fmt: skip
+    As a dict, since importing Options imports torch, which should not come before the first look at the files.
+    """
+    return {
+        "init": read_init(init), "voxel_size": voxel_size, "normalize": normalize, "points": points,
+        "iterations": iterations, "robust": robust, "refine": refine, "model": model, "device": device, "seed": seed,
+    }  # fmt: skip
 
 
 def read_init(text: str, folder: Path = Path()) -> Any:
@@ -56,11 +54,7 @@ def read_init(text: str, folder: Path = Path()) -> Any:
 
 def takes_registration_options(command: Callable) -> Callable:
     """Gives a command every option of ``registration_options``; they come to it as one argument, ``options``."""
-    # Options is imported for type checkers only, since what it needs takes long to import.
-    shared, own = (
-        inspect.signature(function, eval_str=True, locals={"Options": Any})
-        for function in (registration_options, command)
-    )
+    shared, own = (inspect.signature(function, eval_str=True) for function in (registration_options, command))
 
     @functools.wraps(command)
     def run(**given: Any) -> None:

@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -18,9 +18,6 @@ from rich.console import Console
 from fmr_cli import __version__
 from fmr_cli.arguments import takes_registration_options
 from fmr_cli.errors import FmrError
-
-if TYPE_CHECKING:
-    from fmr_cli.registration import Options
 
 app = typer.Typer(
     help="Feature-metric point cloud registration: two scans in, the right transform out.",
@@ -45,7 +42,7 @@ def root(version: bool = typer.Option(False, "--version", help="Print the versio
 def align_command(
     source: Annotated[Path, typer.Argument(help="The cloud that is moved.", show_default=False)],
     target: Annotated[Path, typer.Argument(help="The cloud that it is moved onto.", show_default=False)],
-    options: Options,
+    options: dict[str, Any],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="The 4x4 transform: .txt, .npy or .json. [default: to stdout]")
     ] = None,
@@ -63,9 +60,9 @@ def align_command(
     ])  # fmt: skip
     moving = io.read_cloud(source, attributes=bool(aligned or merged))
     fixed = io.read_cloud(target, attributes=bool(merged))
-    from fmr_cli.registration import align  # after reading: a bad file is said at once, without waiting for torch
+    from fmr_cli.registration import Options, align  # after reading: a bad file is said at once, before torch is there
 
-    found = align(moving, fixed, options)
+    found = align(moving, fixed, Options(**options))
     T, said, warnings = found.T_target_source, outputs.metrics(moving, fixed, found), [*found.warnings]
     if aligned:
         warnings += io.write_cloud(aligned, outputs.aligned_cloud(moving, fixed, T))
@@ -96,7 +93,7 @@ def batch_command(
         Path,
         typer.Argument(help="CSV: source, target and optionally init, name; paths relative to it.", show_default=False),
     ],
-    options: Options,
+    options: dict[str, Any],
     out: Annotated[Path, typer.Option(help="The folder for results.csv and transforms/.", show_default=False)],
     aligned: Annotated[bool, typer.Option("--aligned", help="Write each moved source to aligned/.")] = False,
     merged: Annotated[bool, typer.Option("--merged", help="Write both clouds of each pair to merged/.")] = False,
@@ -119,8 +116,9 @@ def batch_command(
     )
 
     from fmr_cli.batch import Batch
+    from fmr_cli.registration import Options
 
-    batch = Batch(manifest, out, options, aligned=aligned, merged=merged)
+    batch = Batch(manifest, out, Options(**options), aligned=aligned, merged=merged)
     done = batch.open(resume)
     count = Counter(row["status"] for row in done)
     columns = (

@@ -1,0 +1,174 @@
+"""`fmr batch`: a row a pair, whatever happens to the pairs or to the process."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from fmr_cli import PointCloud, read_cloud, read_transform, write_cloud
+
+MANIFEST = """source,target,name
+a.ply,b.ply,
+a.ply,missing.ply,
+a.ply,b.ply,../first
+b.ply,a.ply,../first
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, samples):
+    """A manifest of two good pairs in both directions and a bad one, with files of few points."""
+    for name in "ab":
+        cloud = read_cloud(samples / f"scan_{name}.ply")
+        write_cloud(tmp_path / f"{name}.ply", cloud)
+    (tmp_path / "pairs.csv").write_text(MANIFEST)
+    return tmp_path
+
+
+def rows(folder, out="out"):
+    with (folder / out / "results.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def without_seconds(table):
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in table]
+
+
+def test_a_row_for_each_pair_in_the_manifests_order(fmr, folder, truth, pose_error):
+    done = fmr("batch", "pairs.csv", "--out", "out", "--aligned", "--merged", cwd=folder)
+    assert done.returncode == 3, done.stderr
+    assert "3 aligned, 0 uncertain, 1 failed" in done.stderr
+    table = rows(folder)
+    assert [(row["source"], row["target"]) for row in table] == [
+        ("a.ply", "b.ply"), ("a.ply", "missing.ply"), ("a.ply", "b.ply"), ("b.ply", "a.ply"),
+    ]  # fmt: skip
+    assert [row["status"] for row in table] == ["aligned", "failed", "aligned", "aligned"]
+    assert "missing.ply" in table[1]["message"]
+    assert table[1]["transform"] == ""
+    for row, expected in zip([table[0], *table[2:]], [truth, truth, np.linalg.inv(truth)], strict=True):
+        assert max(pose_error(read_transform(folder / "out" / row["transform"]), expected)) < 0.5
+        assert float(row["seconds"]) > 0
+        assert 0 < float(row["overlap"]) <= 1
+    transforms = sorted(path.name for path in (folder / "out" / "transforms").iterdir())
+    assert transforms == ["1_a_b.txt", "_first.txt", "_first_2.txt"], "every name is a safe one, and used once"
+    assert "residual" in read_cloud(folder / "out" / "aligned" / "1_a_b.ply").attributes
+    assert "source_id" in read_cloud(folder / "out" / "merged" / "1_a_b.ply").attributes
+
+
+def test_the_same_results_with_any_number_of_workers_and_as_one_pair(fmr, folder):
+    (folder / "pairs.csv").write_text("source,target\n" + 3 * "a.ply,b.ply\n")
+    for workers in (1, 3):
+        assert fmr("batch", "pairs.csv", "--out", f"w{workers}", "--workers", workers, cwd=folder).returncode == 0
+    assert without_seconds(rows(folder, "w1")) == without_seconds(rows(folder, "w3"))
+    single = fmr("align", "a.ply", "b.ply", "-q", cwd=folder).stdout
+    for path in (*(folder / "w1/transforms").iterdir(), *(folder / "w3/transforms").iterdir()):
+        assert path.read_text() == single
+
+
+def test_a_kill_loses_no_row_and_resume_repeats_none(fmr, folder):
+    (folder / "pairs.csv").write_text("source,target\n" + 6 * "a.ply,b.ply\n")
+    command = [sys.executable, "-m", "fmr_cli.cli", "batch", "pairs.csv", "--out", "out", "--workers", "1"]
+    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.DEVNULL)
+    results = folder / "out" / "results.csv"
+    while process.poll() is None and not (results.exists() and results.read_text().count("\n") >= 3):
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    whole = results.read_text()
+    survived = rows(folder)[: whole.count("\n") - 1]
+    assert 2 <= len(survived) < 6
+    results.write_text(whole + "a.ply,b.p")  # what a kill in the middle of a row leaves
+
+    assert fmr("batch", "pairs.csv", "--out", "out", cwd=folder).returncode == 2
+    done = fmr("batch", "pairs.csv", "--out", "out", "--workers", "1", "--resume", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "6 aligned" in done.stderr
+    assert rows(folder)[: len(survived)] == survived, "the rows that were there stay, their seconds too"
+    assert len(rows(folder)) == 6
+    again = results.read_bytes()
+    assert fmr("batch", "pairs.csv", "--out", "out", "--resume", cwd=folder).returncode == 0
+    assert results.read_bytes() == again
+
+
+def test_resume_refuses_another_manifest_and_other_settings(fmr_here, folder):
+    (folder / "pairs.csv").write_text("source,target\na.ply,missing.ply\n")
+    (folder / "other.csv").write_text("source,target\nb.ply,missing.ply\n")
+    assert fmr_here("batch", "pairs.csv", "--out", "out", cwd=folder).returncode == 3
+    before = (folder / "out" / "results.csv").read_bytes()
+    for arguments, said in ((["other.csv"], "manifest"), (["pairs.csv", "--seed", 1], "settings")):
+        done = fmr_here("batch", *arguments, "--out", "out", "--resume", cwd=folder)
+        assert done.returncode == 2
+        assert said in done.stderr
+    assert (folder / "out" / "results.csv").read_bytes() == before
+
+
+def test_each_pair_may_have_its_own_start(fmr, folder, truth, samples):
+    (folder / "starts").mkdir()
+    np.save(folder / "starts" / "T.npy", truth)
+    (folder / "pairs.csv").write_text("source, target, init\na.ply, b.ply, starts/T.npy\na.ply, b.ply, nowhere.txt\n")
+    done = fmr("batch", folder / "pairs.csv", "--out", "out", cwd=folder)
+    assert done.returncode == 3
+    first, second = rows(folder)
+    assert first["status"] == "aligned"
+    assert second["status"] == "failed"
+    assert "nowhere.txt" in second["message"]
+
+
+BAD = {
+    "no manifest": None,
+    "empty": "",
+    "no columns": "from,to\na.ply,b.ply\n",
+    "no pair": "source,target\n",
+    "no target": "source,target\na.ply,\n",
+    "no text": "\0\1\2",
+}
+
+
+@pytest.mark.parametrize("text", BAD.values(), ids=BAD)
+def test_a_bad_manifest_is_one_line_and_leaves_nothing(fmr_here, tmp_path, text):
+    if text is not None:
+        (tmp_path / "pairs.csv").write_text(text)
+    done = fmr_here("batch", "pairs.csv", "--out", "out", cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "pairs.csv" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_folder_without_a_parent(fmr_here, folder):
+    done = fmr_here("batch", "pairs.csv", "--out", "no/such", cwd=folder)
+    assert done.returncode == 2
+    assert "does not exist" in done.stderr
+
+
+def test_a_file_of_several_pairs_is_read_once(folder, monkeypatch):
+    from fmr_cli import batch
+    from fmr_cli.registration import Options
+
+    read = []
+    monkeypatch.setattr(batch, "read_cloud", lambda path, **given: read.append(path.name) or read_cloud(path, **given))
+    monkeypatch.setattr(batch, "align", lambda *_: (_ for _ in ()).throw(ValueError("not of interest")))
+    (folder / "pairs.csv").write_text("source,target\n" + 8 * "a.ply,b.ply\nb.ply,a.ply\n")
+    work = batch.Batch(folder / "pairs.csv", folder / "out", Options(), aligned=False, merged=False)
+    work.open(resume=False)
+    assert len(list(work.run(0, workers=4))) == 16
+    assert sorted(read) == ["a.ply", "b.ply"]
+
+
+def test_the_cache_lets_go_of_what_was_used_longest_ago(tmp_path, monkeypatch):
+    from fmr_cli import batch
+
+    monkeypatch.setattr(batch, "CACHED_POINTS", 250)
+    for name in "abc":
+        write_cloud(tmp_path / f"{name}.ply", PointCloud(np.random.default_rng(0).normal(size=(100, 3))))
+    clouds = batch.Clouds(keep=False, seed=0)
+    for name in "abac":
+        clouds.get(tmp_path / f"{name}.ply")
+    assert [path.stem for path in clouds.files] == ["a", "c"]
