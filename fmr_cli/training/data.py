@@ -1,4 +1,4 @@
-"""Batches of training pairs, drawn from a pool of normalised clouds on the device that trains."""
+"""Pairs of clouds with a known transform, as batches on the device that trains. The held-out tests draw from here too."""
 
 from __future__ import annotations
 
@@ -10,88 +10,123 @@ from torch import Tensor
 from fmr_cli.feature_metric import se3
 
 
-@dataclass
+@dataclass(frozen=True)
 class Augment:
-    """How source and target of a pair differ. Ranges are (from, to), drawn evenly for each pair."""
+    """How the source and target of a training pair differ. Each is drawn anew for every pair (density: every batch)."""
 
-    rotation: float = 45.0  # degrees, about any axis
-    shift: float = 0.1  # of the cloud's size, on top of what each cloud's own centring leaves
-    noise: float = 0.02  # largest standard deviation, units of the normalised cloud
-    overlap: float = 0.6  # least share of each cloud that the other has too; 1 for whole clouds
+    rotation: float = 45.0  # degrees at most, about any axis
+    shift: float = 0.8  # at most, in units of the normalised cloud; centring takes it out again where nothing is cut off
+    centre: bool = True  # both clouds centred on their own mean, as `fmr align` does
+    offset: float = 0.05  # at most; a shift that stays after centring
+    noise: float = 0.02  # largest standard deviation, in units of the normalised cloud
+    overlap: float = 0.6  # least share of each cloud that the other one has too; 1 for whole clouds
     whole: float = 0.3  # share of the pairs that overlap fully
     density: float = 0.1  # least share of the points that the source keeps
 
 
-def random_rotations(count: int, generator: torch.Generator, device: torch.device | str) -> Tensor:
+@dataclass
+class Pairs:
+    """source (B, N, 3), target (B, M, 3), normalised; truth: (B, 4, 4) T_target_source."""
+
+    source: Tensor
+    target: Tensor
+    truth: Tensor
+
+    def __getitem__(self, rows: slice) -> Pairs:
+        return Pairs(self.source[rows], self.target[rows], self.truth[rows])
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+
+def random_rotations(count: int, generator: torch.Generator) -> Tensor:
     """(count, 3, 3), uniform in SO(3)."""
-    q = torch.randn(count, 4, generator=generator, device=device)
+    q = torch.randn(count, 4, generator=generator, device=generator.device)
     return se3.from_quaternion(q / q.norm(dim=-1, keepdim=True))
 
 
-def random_motion(count: int, degrees: float, shift: float, generator: torch.Generator, device: torch.device | str) -> Tensor:
-    """(count, 4, 4): a rotation of up to ``degrees`` about any axis and a shift of up to ``shift`` in any direction."""
-    directions = torch.randn(2, count, 3, generator=generator, device=device)
-    directions = directions / directions.norm(dim=-1, keepdim=True)
-    sizes = torch.rand(2, count, 1, generator=generator, device=device)
-    T = torch.eye(4, device=device).repeat(count, 1, 1)
-    twist = torch.cat([directions[0] * sizes[0] * degrees * torch.pi / 180, torch.zeros(count, 3, device=device)], -1)
-    T[:, :3, :3] = se3.exp(twist)[:, :3, :3]
-    T[:, :3, 3] = directions[1] * sizes[1] * shift
+def random_directions(count: int, generator: torch.Generator) -> Tensor:
+    """(count, 3) unit vectors, uniform on the sphere."""
+    v = torch.randn(count, 3, generator=generator, device=generator.device)
+    return v / v.norm(dim=-1, keepdim=True)
+
+
+def random_motions(degrees: Tensor, shift: Tensor, generator: torch.Generator) -> Tensor:
+    """(B, 4, 4): rotations by ``degrees`` (B,) about any axis and shifts by ``shift`` (B,) in any direction."""
+    twist = random_directions(len(degrees), generator) * torch.deg2rad(degrees)[:, None]
+    T = se3.exp(torch.cat([twist, torch.zeros_like(twist)], -1))
+    T[:, :3, 3] = random_directions(len(degrees), generator) * shift[:, None]
     return T
 
 
-def draw_clouds(pool: Tensor, batch: int, generator: torch.Generator) -> Tensor:
-    """(batch, M, 3) clouds of the pool (S, M, 3), each turned uniformly in SO(3) and of half extent 0.5 again."""
-    index = torch.randint(len(pool), (batch,), generator=generator, device=pool.device)
-    clouds = pool[index] @ random_rotations(batch, generator, pool.device)
+def draw_clouds(pool: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """(count, M, 3) clouds of the pool (S, M, 3), each turned uniformly in SO(3), of half extent 0.5, in random order."""
+    index = torch.randint(len(pool), (count,), generator=generator, device=pool.device)
+    order = torch.rand(pool.shape[1], generator=generator, device=pool.device).argsort()
+    clouds = pool[index][:, order] @ random_rotations(count, generator)
     return clouds * (0.5 / clouds.abs().amax((1, 2), keepdim=True))
 
 
-def subset(clouds: Tensor, points: int, generator: torch.Generator) -> Tensor:
-    """(B, points, 3): as many random points of every cloud (B, M, 3), without repeats where there are enough."""
-    M = clouds.shape[1]
-    order = torch.rand(M, generator=generator, device=clouds.device).argsort()
-    return clouds[:, order.repeat(-(-points // M))[:points]]
+def draw_pairs(pool: Tensor, count: int, points: int, augment: Augment, generator: torch.Generator) -> Pairs:
+    """Training pairs of clouds of the pool (S, M, 3); source and target are disjoint samples of ``points`` at most."""
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator, device=pool.device)
+
+    clouds = draw_clouds(pool, count, generator)
+    overlap = 1 - (1 - augment.overlap) * uniform(count)
+    overlap = torch.where(uniform(count) < augment.whole, 1.0, overlap)
+    density = augment.density ** float(uniform().square())  # mostly dense, now and then sparse
+    source, target = cut(clouds[:, ::2], clouds[:, 1::2], overlap, points, generator)
+    source = source[:, : max(int(density * source.shape[1]), 32)]
+    sigma = augment.noise * uniform(count).square()
+    truth = random_motions(augment.rotation * uniform(count), augment.shift * uniform(count), generator)
+    offset = augment.offset * uniform(count)
+    return make_pairs(source, target, truth, sigma, augment.centre, offset, generator)
 
 
-def draw_pairs(
-    pool: Tensor, batch: int, points: int, augment: Augment, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """source, target (batch, points or fewer, 3) and T_target_source (batch, 4, 4).
+def cut(a: Tensor, b: Tensor, overlap: Tensor, points: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Both (B, N, 3) cut by one random direction, so that the share ``overlap`` (B,) of each is common; ``points`` of each.
 
-    Two disjoint samples of a cloud, each cut by the same random direction so that only a share is common; the clouds
-    are normalised as at inference: each centred on its own mean, both by one scale.
+    Two ends that each hold 1 / (2 - overlap) of a cloud have that share of themselves in common.
     """
-    device = pool.device
-    clouds = draw_clouds(pool, batch, generator)
-    M = clouds.shape[1]
-    clouds = clouds[:, torch.rand(M, generator=generator, device=device).argsort()]
-    direction = torch.randn(batch, 3, 1, generator=generator, device=device)
-    halves = []
-    overlap = 1 - (1 - augment.overlap) * torch.rand(batch, generator=generator, device=device)
-    overlap = torch.where(torch.rand(batch, generator=generator, device=device) < augment.whole, 1.0, overlap)
-    keep = 1 / (2 - overlap)  # two parts of this share of the cloud have `overlap` of each in common
-    for side, half in ((1, clouds[:, ::2]), (-1, clouds[:, 1::2])):
-        order = (side * (half @ direction)[..., 0]).argsort(1)
-        rank = torch.rand(batch, half.shape[1], generator=generator, device=device).argsort(1)[:, :points]
-        # ranks within the kept part: the first keep * M/2 of the sorted ones, spread evenly
-        chosen = (rank * keep[:, None]).long()
-        halves.append(half.gather(1, order.gather(1, chosen)[..., None].expand(-1, -1, 3)))
-    source, target = halves
-    low = torch.rand((), generator=generator, device=device)
-    kept = int(points * float(augment.density ** (low * low)))  # mostly dense, now and then a tenth
-    source = source[:, : max(kept, 32)]
-    sigma = augment.noise * torch.rand(batch, 1, 1, generator=generator, device=device).square()
-    source = source + sigma * torch.randn(source.shape, generator=generator, device=device)
-    target = target + sigma * torch.randn(target.shape, generator=generator, device=device)
+    direction = random_directions(len(a), generator)[..., None]
+    keep = 1 / (2 - overlap)
+    parts = []
+    for side, cloud in ((1, a), (-1, b)):
+        order = (side * (cloud @ direction)[..., 0]).argsort(1)
+        rank = torch.rand(order.shape, generator=generator, device=a.device).argsort(1)[:, :points]
+        chosen = order.gather(1, (rank * keep[:, None]).long())  # spread evenly over the first `keep` of the sorted
+        parts.append(cloud.gather(1, chosen[..., None].expand(-1, -1, 3)))
+    return parts[0], parts[1]
 
-    motion = random_motion(batch, augment.rotation, augment.shift, generator, device)
-    moved = se3.transform(torch.linalg.inv(motion), source)  # motion maps what the solver gets back onto the target
-    centre_s, centre_t = moved.mean(1), target.mean(1)
-    scale = 0.5 / torch.maximum((moved - centre_s[:, None]).abs().amax((1, 2)), (target - centre_t[:, None]).abs().amax((1, 2)))
-    truth = motion.clone()
-    # centred source s' = s - cs moves to R (s' + cs) + t - ct
-    offset = (motion[:, :3, :3] @ centre_s[..., None])[..., 0] + motion[:, :3, 3] - centre_t
-    spread = augment.shift * 0
-    truth[:, :3, 3] = (offset + spread) * scale[:, None]
-    return (moved - centre_s[:, None]) * scale[:, None, None], (target - centre_t[:, None]) * scale[:, None, None], truth
+
+def make_pairs(
+    source: Tensor,
+    target: Tensor,
+    truth: Tensor,
+    sigma: Tensor,
+    centre: bool,
+    offset: Tensor,
+    generator: torch.Generator,
+) -> Pairs:
+    """Source (B, N, 3), which lies on target (B, M, 3), is taken away by the inverse of truth (B, 4, 4); both normalised.
+
+    One scale for both (largest half extent 0.5). ``centre``: each cloud is centred on its own mean, else both on the
+    target's. sigma (B,): noise on every coordinate. offset (B,): a shift of the source that stays.
+    """
+    source, target = (
+        x + sigma[:, None, None] * torch.randn(x.shape, generator=generator, device=x.device) for x in (source, target)
+    )
+    source = se3.transform(torch.linalg.inv(truth), source)
+    cs, ct = source.mean(1), target.mean(1)
+    scale = 0.5 / torch.maximum(*((x - c[:, None]).abs().amax((1, 2)) for x, c in ((source, cs), (target, ct))))
+    if not centre:
+        cs = ct
+    stay = random_directions(len(source), generator) * offset[:, None]
+    # x' = (x - cs) scale + stay, so that x_target' = R x' + (R cs + t - ct) scale - R stay
+    R, t = truth[:, :3, :3], truth[:, :3, 3]
+    normalised = truth.clone()
+    normalised[:, :3, 3] = ((R @ cs[..., None])[..., 0] + t - ct) * scale[:, None] - (R @ stay[..., None])[..., 0]
+    source = (source - cs[:, None]) * scale[:, None, None] + stay[:, None]
+    return Pairs(source, (target - ct[:, None]) * scale[:, None, None], normalised)

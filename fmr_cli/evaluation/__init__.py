@@ -1,0 +1,1 @@
+"""How well an encoder registers: the paper's experiments, on any clouds."""
