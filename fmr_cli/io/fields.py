@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from typing import BinaryIO
 
 import numpy as np
@@ -195,8 +196,14 @@ def read_table(
     wide = np.dtype([(n, dtype[n] if dtype[n].kind in "iu" and dtype[n].itemsize == 8 else np.float64) for n in names])
     if rows == 0:
         return np.empty(0, dtype)
+    # numpy prints a warning where there is nothing at all to read
+    first = next((line for line in lines if (line.split(comments)[0] if comments else line).strip()), None)
+    if first is None:
+        if rows:
+            raise CloudFileError(f"promises {rows} points and holds none, it is truncated: copy it again")
+        return np.empty(0, dtype)
     try:
-        table = np.loadtxt(lines, wide, comments=comments, delimiter=delimiter, max_rows=rows, ndmin=1)
+        table = np.loadtxt(chain([first], lines), wide, comments=comments, delimiter=delimiter, max_rows=rows, ndmin=1)
     except ValueError:
         text = lines.last.strip()[:60]
         raise CloudFileError(f"line {lines.number}: expected {len(names)} numbers, found {text!r}") from None

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import laspy
+import lazrs
 import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
@@ -20,7 +21,10 @@ logging.getLogger("laspy").addHandler(logging.NullHandler())  # its errors come 
 
 WITH_COLORS = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}  # the point format that adds red, green and blue
 LARGEST = 2**31 - 1
+SMALL, LAZ_LIMIT = 1 << 26, 5000  # bytes nobody minds to allocate; and LAZ does not shrink scans more than this
 PROJECTED, GEOGRAPHIC, USER_DEFINED = 3072, 2048, 32767  # GeoTIFF keys, and their value for "not in EPSG"
+# Compressed layers of LAZ 1.4 by the item's type: point, RGB, RGB + NIR, wave packet; of extra bytes one each (14)
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 XYZ = laspy.DecompressionSelection.xy_returns_channel().decompress_z()
 
 
@@ -41,8 +45,10 @@ def read(path: Path, attributes: bool) -> PointCloud:
     check_header(path)
     selection = laspy.DecompressionSelection.all() if attributes else XYZ
     try:
-        with laspy.open(ClippedFile(path), decompression_selection=selection) as reader:
+        with ClippedFile(path) as file, laspy.open(file, decompression_selection=selection, closefd=False) as reader:
             header = reader.header
+            if header.are_points_compressed and header.point_count:
+                check_layers(file, header)
             dimensions = header.point_format.dimensions
             # Extra bytes may be called as another dimension is; numpy and laspy tell them apart by name only.
             for k, name in enumerate(unique([d.name for d in dimensions])):
@@ -110,6 +116,34 @@ def check_chunks(file: io.BufferedReader, size: int, start: int, count: int, poi
     chunks = int.from_bytes(words[4:], "little")
     if chunks * point_size > table - start or chunks > count or chunks == 0:
         raise CloudFileError("has a damaged table of compressed chunks: copy it again")
+
+
+def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
+    """LAZ: chunks, and in 1.4 their layers, must be of a possible size, since lazrs allocates what they promise.
+
+    Leaves the file at the start of the points.
+    """
+    records = header.vlrs.get("LasZipVlr")
+    if not records:
+        raise CloudFileError("is compressed and lacks the record that says how, it is damaged: copy it again")
+    record = records[0].record_data
+    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(struct.unpack_from("<H", record, 32)[0])]
+    layers = sum(LAYERS.get(kind, size) for kind, size in items if kind >= min(LAYERS))
+    file.seek(header.offset_to_point_data)
+    table = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
+    if sum(count for count, _ in table) < header.point_count:
+        raise CloudFileError(f"promises {header.point_count} points and holds fewer, it is truncated: copy it again")
+    if max(count for count, _ in table) * header.point_format.size > max(SMALL, LAZ_LIMIT * file.size):
+        raise CloudFileError("promises more points than its compressed data can hold, it is damaged: copy it again")
+    start = header.offset_to_point_data + 8
+    raw = sum(size for _, size in items) + 4  # a chunk begins with its first point as it is and a count
+    for _, size in table if layers else []:
+        file.seek(start)
+        head = file.read(raw + 4 * layers)
+        if len(head) < raw + 4 * layers or len(head) + sum(struct.unpack_from(f"<{layers}I", head, raw)) > size:
+            raise CloudFileError("has a damaged compressed chunk: copy it again")
+        start += size
+    file.seek(header.offset_to_point_data)
 
 
 def joined(parts: list[np.ndarray]) -> np.ndarray:

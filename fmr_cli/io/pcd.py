@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 from dataclasses import dataclass
-from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO
 
@@ -121,7 +120,7 @@ def flat_names(fields: np.dtype) -> list[tuple[str, np.dtype]]:
 
 
 def read_text(file: BinaryIO, header: Header) -> np.ndarray:
-    lines = Lines(TextIOWrapper(file, "utf-8", errors="replace"), header.lines)
+    lines = Lines((line.decode("utf-8", errors="replace") for line in file), header.lines)
     flat = read_table(lines, np.dtype(flat_names(header.fields)), header.points)
     return np.frombuffer(flat.tobytes(), header.fields, len(flat))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import struct
 from dataclasses import dataclass, field
@@ -74,23 +73,23 @@ def read(path: Path, attributes: bool) -> PointCloud | Mesh:
         header = read_header(file)
         found: dict[str, dict[str, Any]] = {}
         left_out = []
-        text = Lines(io.TextIOWrapper(file, "utf-8", errors="replace"), header.lines) if not header.order else None
-        left = os.path.getsize(path) - file.tell() if text is None else os.path.getsize(path)
+        size = os.path.getsize(path)
+        decoded = (line.decode("utf-8", errors="replace") for line in file)
+        text = None if header.order else Lines(decoded, header.lines)
         for element in header.elements:
-            if element.count * element.least_row(binary=text is None) > left + 1:
+            left = size + 1 if text else size - file.tell()  # the last line of a text may lack its end
+            if element.count * element.least_row(binary=text is None) > left:
                 raise CloudFileError(
                     f"its header promises {element.count} of {element.name!r} and the file is too short for them, "
                     "it is truncated or damaged: copy it again"
                 )
-            if text is not None:
+            if text:
                 found[element.name] = read_text(text, element)
             elif element.has_lists:
                 found[element.name] = read_lists(file, element, header.order)
             else:
                 records = np.fromfile(file, element.dtype(header.order), element.count if element.properties else 0)
                 found[element.name] = {name: records[name] for name in records.dtype.names or ()}
-            if text is None:
-                left = os.path.getsize(path) - file.tell()
             if element.name not in ("vertex", "face"):
                 left_out.append(f"element {element.name!r}")
             if {"vertex", "face"} <= set(found):
