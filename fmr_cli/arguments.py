@@ -23,7 +23,15 @@ def registration_options(
     init: Annotated[str, option(f"Where to start: {', '.join(STARTS)}, or a transform file.")] = "auto",
     voxel_size: Annotated[float | None, option("Working voxel edge. [default: from the data]", min=0.0)] = None,
     normalize: Annotated[bool, option("Scale the clouds to the encoder's unit box.")] = True,
-    points: Annotated[int, option("Points that the global encoder sees.", min=10)] = 2048,
+    points: Annotated[int, option("Points that the global encoder sees.", min=10)] = 1024,
+    dof: Annotated[
+        Literal["rigid", "yaw", "translation", "planar"],
+        option("What may move; yaw: a rotation about --up and any shift, planar: none along it."),
+    ] = "rigid",
+    up: Annotated[tuple[float, float, float], option("The vertical, for yaw and planar.")] = (0.0, 0.0, 1.0),
+    scale: Annotated[bool, option("Also estimate one scale factor.", "--scale")] = False,
+    max_angle: Annotated[float | None, option("No rotation beyond it, in degrees.", min=0.0)] = None,
+    max_shift: Annotated[float | None, option("No shift of the source's centre beyond it.", min=0.0)] = None,
     iterations: Annotated[int, option("Iterations of the solver, at most.", min=1)] = 10,
     robust: Annotated[bool, option("Robust weights, or the paper's plain least squares.")] = True,
     refine: Annotated[bool, option("Finish with a geometric polish.")] = True,
@@ -36,8 +44,9 @@ def registration_options(
     As a dict, since importing Options imports torch, which should not come before the first look at the files.
     """
     return {
-        "init": read_init(init), "voxel_size": voxel_size, "normalize": normalize, "points": points,
-        "iterations": iterations, "robust": robust, "refine": refine, "model": model, "device": device, "seed": seed,
+        "init": read_init(init), "voxel_size": voxel_size, "normalize": normalize, "points": points, "dof": dof,
+        "up": up, "scale": scale, "max_angle": max_angle, "max_shift": max_shift, "iterations": iterations,
+        "robust": robust, "refine": refine, "model": model, "device": device, "seed": seed,
     }  # fmt: skip
 
 

@@ -213,7 +213,7 @@ class Batch:
                 "transform": f"transforms/{pair.name}.txt",
                 "overlap": f"{found.overlap:.6g}",
                 "inlier_rmse": f"{found.inlier_rmse:.6g}",
-                "feature_error": f"{found.feature_errors[-1]:.6g}" if found.feature_errors else "",
+                "feature_error": f"{found.feature_error_after:.6g}",
                 "confidence": f"{found.confidence:.6g}",
                 "message": "; ".join(warnings),
             }

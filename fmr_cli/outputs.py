@@ -95,10 +95,15 @@ def metrics(source: PointCloud, target: PointCloud, found: Registration) -> dict
 
 def summary(source: PointCloud, target: PointCloud, found: Registration) -> list[str]:
     """One line for a person, and one for each thing that should not go unnoticed."""
+    scale = f"scale {found.scale:.6g}, " if found.options.scale else ""
     lines = [
         f"{found.status} (confidence {found.confidence:.2f}): rotation {found.angle:.4g} deg, shift {found.shift:.6g}, "
-        f"overlap {found.overlap:.0%}, RMSE {found.inlier_rmse:.3g}, {found.seconds['total']:.2f} s"
+        f"{scale}overlap {found.overlap:.0%}, RMSE {found.inlier_rmse:.3g}, {found.seconds['total']:.2f} s"
     ]
+    if found.undetermined:
+        lines.append(f"the scans hardly determine: {'; '.join(found.undetermined)}")
+    if found.alternatives:
+        lines.append(f"{len(found.alternatives)} other poses fit about as well: see alternatives in the metrics")
     for cloud in (source, target):
         if cloud.dropped:
             lines.append(f"{cloud.name}: {cloud.dropped} points without finite coordinates are left out")
