@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -184,6 +184,53 @@ def transform_command(
     warnings = io.write_cloud(out, io.read_cloud(file).transformed(np.linalg.inv(T) if inverse else T))
     for warning in [] if quiet else warnings:
         say(f"warning: {warning}")
+
+
+@app.command("train")
+def train_command(
+    scans: Annotated[
+        list[Path] | None, typer.Argument(help="Scans, meshes, or folders of them.", show_default=False)
+    ] = None,
+    unsupervised: Annotated[bool, typer.Option("--unsupervised", help="The Chamfer loss alone; no label.")] = False,
+    semi_supervised: Annotated[
+        bool, typer.Option("--semi-supervised", help="And the point error of registering moved, cut, noisy copies.")
+    ] = False,
+    pairs: Annotated[Path | None, typer.Option(help="Labelled pairs, CSV: source, target, transform.")] = None,
+    recipe: Annotated[Path | None, typer.Option(help="All settings, .toml; options given here go before it.")] = None,
+    start: Annotated[str | None, typer.Option("--from", help="base, scratch, or weights. [default: base]")] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="The folder of the run.")] = Path("runs/train"),
+    minutes: Annotated[float | None, typer.Option(help="Stop after so long.", min=0.0, show_default=False)] = None,
+    epochs: Annotated[int | None, typer.Option(help="Stop after so many epochs.", min=1, show_default=False)] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, to the same end.")] = False,
+    learning_rate: Annotated[float | None, typer.Option(help="Adam's. [default: 0.0003]", min=0.0)] = None,
+    rotation: Annotated[float | None, typer.Option(help="Of a moved copy, deg at most. [default: 45]", min=0.0)] = None,
+    shift: Annotated[float | None, typer.Option(help="Of a moved copy, its size 1. [default: 0.8]", min=0.0)] = None,
+    noise: Annotated[float | None, typer.Option(help="Largest deviation, size 1. [default: 0.02]", min=0.0)] = None,
+    density: Annotated[
+        float | None, typer.Option(help="Least share of the points. [default: 0.1]", min=0.01, max=1.0)
+    ] = None,
+    overlap: Annotated[float | None, typer.Option(help="Least overlap. [default: 0.6]", min=0.1, max=1.0)] = None,
+    seed: Annotated[int | None, typer.Option(help="The same seed gives the same weights (CPU).", min=0)] = None,
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to train.")] = "auto",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
+) -> None:
+    """Learn an encoder from SCANS, starting from the bundled one; see what it gained.
+
+    The folder of the run gets model.safetensors (the best epoch's weights, for `fmr align --model`), README.md (what
+    they were made from, held-out figures), recipe.toml, metrics.csv and state.safetensors (for --resume).
+    """
+    from fmr_cli.training.run import settings
+
+    if resume and (unsupervised or semi_supervised or recipe or start or learning_rate is not None or seed is not None):
+        raise FmrError("--resume goes on with the settings saved in --out; leave the other settings away")
+    chosen = settings(
+        recipe, unsupervised=unsupervised, semi_supervised=semi_supervised or pairs is not None, resume=resume,
+        minutes=minutes, epochs=epochs, start=start, learning_rate=learning_rate, rotation=rotation, shift=shift,
+        noise=noise, density=density, overlap=overlap, seed=seed,
+    )  # fmt: skip
+    from fmr_cli.training.display import train
+
+    train(scans or [], chosen, out, err, pairs=pairs, minutes=minutes, resume=resume, device=device, quiet=quiet)
 
 
 def say(text: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -18,9 +19,11 @@ Device = Literal["auto", "cpu", "cuda"]
 
 
 def pick_device(device: Device = "auto") -> torch.device:
-    """"auto" is the GPU where there is one. Raises ModelError for "cuda" without one."""
+    """The device by name; auto is the GPU where there is one. Raises ModelError for cuda without one."""
     if device == "cuda" and not torch.cuda.is_available():
-        raise ModelError("--device cuda: this machine has no usable GPU (torch.cuda.is_available() is false); use auto or cpu")
+        raise ModelError(
+            "--device cuda: this machine has no usable GPU (torch.cuda.is_available() is false); use auto or cpu"
+        )
     return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -30,8 +33,13 @@ def encoder(model: Path | None = None, device: Device = "auto") -> Encoder:
     place = pick_device(device)
     if model is not None:
         return load_encoder(model).to(place)
-    with as_file(files("fmr_cli.models") / "base.safetensors") as path:
+    with bundled_path() as path:
         return load_encoder(path).to(place)
+
+
+def bundled_path() -> AbstractContextManager[Path]:
+    """The bundled encoder's file, for as long as the context is open."""
+    return as_file(files("fmr_cli.models") / "base.safetensors")
 
 
 def bundled_encoder() -> Encoder:

@@ -81,6 +81,11 @@ class Errors:
         """Share of the rotations below 5 degrees."""
         return float((self.rotation < SUCCESS).mean())
 
+    @property
+    def median(self) -> float:
+        """Of the rotation errors, in degrees."""
+        return float(np.median(self.rotation))
+
 
 def errors(estimate: Tensor, truth: Tensor) -> Errors:
     """Estimates against truths, both (B, 4, 4). NaN counts as half a turn."""

@@ -1,4 +1,4 @@
-"""Pairs of clouds with a known transform, as batches on the device that trains. The held-out tests draw from here too."""
+"""Pairs of clouds with a known transform, in batches on the device that trains; the held-out tests draw here too."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ class Augment:
     """How the source and target of a training pair differ. Each is drawn anew for every pair (density: every batch)."""
 
     rotation: float = 45.0  # degrees at most, about any axis
-    shift: float = 0.8  # at most, in units of the normalised cloud; centring takes it out again where nothing is cut off
+    shift: float = (
+        0.8  # at most, in units of the normalised cloud; centring takes it out again where nothing is cut off
+    )
     centre: bool = True  # both clouds centred on their own mean, as `fmr align` does
     offset: float = 0.05  # at most; a shift that stays after centring
     noise: float = 0.02  # largest standard deviation, in units of the normalised cloud
@@ -60,7 +62,7 @@ def random_motions(degrees: Tensor, shift: Tensor, generator: torch.Generator) -
 
 
 def draw_clouds(pool: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count, M, 3) clouds of the pool (S, M, 3), each turned uniformly in SO(3), of half extent 0.5, in random order."""
+    """(count, M, 3) clouds of the pool (S, M, 3), each turned uniformly in SO(3), half extent 0.5, in random order."""
     index = torch.randint(len(pool), (count,), generator=generator, device=pool.device)
     order = torch.rand(pool.shape[1], generator=generator, device=pool.device).argsort()
     clouds = pool[index][:, order] @ random_rotations(count, generator)
@@ -86,7 +88,7 @@ def draw_pairs(pool: Tensor, count: int, points: int, augment: Augment, generato
 
 
 def cut(a: Tensor, b: Tensor, overlap: Tensor, points: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Both (B, N, 3) cut by one random direction, so that the share ``overlap`` (B,) of each is common; ``points`` of each.
+    """Both (B, N, 3) cut by one random direction, so that a share ``overlap`` (B,) is common; ``points`` of each.
 
     Two ends that each hold 1 / (2 - overlap) of a cloud have that share of themselves in common.
     """
@@ -110,7 +112,7 @@ def make_pairs(
     offset: Tensor,
     generator: torch.Generator,
 ) -> Pairs:
-    """Source (B, N, 3), which lies on target (B, M, 3), is taken away by the inverse of truth (B, 4, 4); both normalised.
+    """Source (B, N, 3), lying on target (B, M, 3), is taken away by the inverse of truth (B, 4, 4); both normalised.
 
     One scale for both (largest half extent 0.5). ``centre``: each cloud is centred on its own mean, else both on the
     target's. sigma (B,): noise on every coordinate. offset (B,): a shift of the source that stays.

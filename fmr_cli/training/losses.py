@@ -1,7 +1,7 @@
 """The two losses of the paper: Chamfer through the decoder (no label needed), and the point error of the unrolled IC.
 
-Both reach the encoder through the critical points alone. Which points those are is found without a gradient, in bfloat16
-where the machine multiplies it faster; their values are exact.
+Both reach the encoder through the critical points alone. Which points those are is found without a gradient and in
+bfloat16, which is faster; their values are exact.
 """
 
 from __future__ import annotations

@@ -1,0 +1,126 @@
+"""Every setting of a training run, as a TOML file that can be read back and run again."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from fmr_cli.errors import FmrError
+from fmr_cli.training.data import Augment
+
+
+class RecipeError(FmrError):
+    """A recipe that cannot be run as written."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is trained, on what, and how. Angles in degrees, lengths in units of the normalised cloud."""
+
+    start: str = "base"  # "base", "scratch" or a .safetensors file
+    feature_dim: int = 1024  # from scratch only; otherwise the start's
+    hidden: tuple[int, ...] = (64, 64, 64, 128)
+    shapes: int = 0  # procedural shapes; 0 for the scans on the command line
+    crops: int = 4096  # at most, cut from the scans
+    cloud_points: int = 2048  # kept of every shape or crop
+    points: int = 512  # of each cloud in a step
+    chamfer_weight: float = 1.0
+    chamfer_batch: int = 24
+    pose_weight: float = 0.0
+    pose_batch: int = 12
+    pose_after: float = 0.0  # share of the steps before the pose loss sets in
+    chamfer_until: float = 1.0  # share of the steps after which the Chamfer loss stops
+    unroll: int = 5  # IC iterations that the pose loss goes through
+    robust: bool = True  # Geman-McClure weights in the unrolled iterations
+    decoder_warmup: int = 200  # steps for a new decoder alone, where the encoder is already trained
+    learning_rate: float = 1e-3
+    clip: float = 1.0  # largest norm of the gradient
+    steps: int = 3000
+    epoch_steps: int = 100
+    seed: int = 0
+    held_out: float = 0.15  # share of the clouds that are never trained on
+    held_out_pairs: int = 48  # registered at each setting after every epoch
+    augment: Augment = field(default_factory=Augment)
+
+    def __post_init__(self) -> None:
+        wrong = [
+            f"{name} = {value}"
+            for name, value in asdict(self).items()
+            if isinstance(value, int | float) and not isinstance(value, bool) and value < 0
+        ]
+        for name in ("feature_dim", "cloud_points", "points", "chamfer_batch", "pose_batch", "unroll", "steps"):
+            if getattr(self, name) < 1:
+                wrong.append(f"{name} = {getattr(self, name)}")
+        if wrong:
+            raise RecipeError(f"the recipe has {wrong[0]}; give a larger number")
+        if self.epoch_steps < 1 or self.held_out_pairs < 1 or not 0 < self.held_out < 1:
+            raise RecipeError("the recipe needs epoch_steps and held_out_pairs of 1 or more, held_out between 0 and 1")
+        if not 0 < self.augment.overlap <= 1 or not 0 < self.augment.density <= 1:
+            raise RecipeError("the recipe's overlap and density must be above 0 and at most 1")
+        if self.chamfer_weight == 0 and self.pose_weight == 0:
+            raise RecipeError("the recipe has no loss; set chamfer_weight or pose_weight above 0")
+
+    def changed(self, **changes: Any) -> Recipe:
+        """A copy with other values; keys of Augment go there. Values of None are left as they are."""
+        given = {name: value for name, value in changes.items() if value is not None}
+        names = {f.name for f in fields(Augment)}
+        augment = replace(self.augment, **{name: value for name, value in given.items() if name in names})
+        return replace(self, augment=augment, **{name: value for name, value in given.items() if name not in names})
+
+    def toml(self) -> str:
+        """The recipe as TOML, every key of it."""
+        own = asdict(self)
+        augment = own.pop("augment")
+        lines = [f"{name} = {_value(value)}" for name, value in own.items()]
+        return "\n".join(
+            [*lines, "", "[augment]", *(f"{name} = {_value(value)}" for name, value in augment.items()), ""]
+        )
+
+
+def _value(value: Any) -> str:
+    return json.dumps(list(value) if isinstance(value, tuple) else value)
+
+
+def read_recipe(path: Path | str) -> Recipe:
+    """Reads a TOML recipe; keys that it lacks keep their defaults. Raises RecipeError for what cannot be run."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        table = tomllib.loads(text)
+    except FileNotFoundError:
+        raise RecipeError(f"{path}: no such recipe; give a .toml file") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise RecipeError(f"{path}: not valid TOML ({error}); see models/base.toml for an example") from None
+    augment = table.pop("augment", {})
+    if not isinstance(augment, dict):
+        raise RecipeError(f"{path}: augment must be a table, [augment]")
+    try:
+        return Recipe(**_checked(Recipe, table), augment=Augment(**_checked(Augment, augment)))
+    except RecipeError as error:
+        raise RecipeError(f"{path}: {error}") from None
+
+
+def _checked(cls: type, table: dict[str, Any]) -> dict[str, Any]:
+    """The table's values, each a key of the dataclass and of its default's type."""
+    defaults = {f.name: f.default for f in fields(cls)} | ({"augment": None} if cls is Recipe else {})
+    values = {}
+    for name, value in table.items():
+        if name not in defaults or name == "augment":
+            raise RecipeError(f"unknown key {name!r}; known are {', '.join(k for k in defaults if k != 'augment')}")
+        default: Any = defaults[name]
+        if isinstance(default, float) and type(value) is int:
+            value = float(value)
+        if isinstance(default, tuple) and isinstance(value, list) and all(type(v) is int and v > 0 for v in value):
+            value = tuple(value)
+        if type(value) is not type(default):
+            raise RecipeError(f"{name} must be {_kind(default)}, not {value!r}")
+        values[name] = value
+    return values
+
+
+def _kind(default: Any) -> str:
+    kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    return kinds.get(type(default), "a list of whole numbers above 0")

@@ -1,0 +1,150 @@
+"""Scans as training material: files found, cut into overlapping crops at several scales, sampled to one size."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fmr_cli.cloud import transform_points
+from fmr_cli.errors import FmrError
+from fmr_cli.io import SUFFIXES, read_cloud, read_transform
+from fmr_cli.preprocess import sample, voxel_downsample
+
+TABLES = (".txt", ".csv", ".npy", ".npz")  # also poses, calibrations, time stamps
+CROPS_OF_A_SCAN = 24
+SMALLEST = 256  # points of a crop on its grid
+RADII = (0.25, 1.0)  # of a crop, as shares of the distance that 90 % of the scan's points lie within
+GRID = 30  # voxel edges in a crop's radius: evens out a LiDAR's rings, keeps some thousand points
+TRIES = 3  # crops drawn for each that is wanted
+
+
+@dataclass
+class Material:
+    """clouds: (S, M, 3) float32, each centred and of half extent 0.5; scan: (S,) which file each is from."""
+
+    clouds: np.ndarray
+    scan: np.ndarray
+    files: list[Path]
+    skipped: list[str]
+
+
+def find_scans(paths: Iterable[Path]) -> list[Path]:
+    """The readable files among the paths, folders searched recursively, sorted. Raises FmrError where there are none.
+
+    Tables (.txt, .csv, .npy, .npz) in a folder count as scans only if it holds nothing that surely is one.
+    """
+    paths, found = list(paths), []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = sorted(f for f in path.rglob("*") if f.is_file() and f.suffix.lower() in SUFFIXES)
+        sure = [f for f in inside if f.suffix.lower() not in TABLES]
+        found += sure or inside
+    if not found:
+        raise FmrError(f"{', '.join(map(str, paths))}: no scan in there; give files of the kinds {' '.join(SUFFIXES)}")
+    return found
+
+
+def load_material(
+    files: list[Path],
+    crops: int,
+    cloud_points: int,
+    seed: int,
+    progress: Callable[[int, int], None] = lambda i, n: None,
+) -> Material:
+    """Reads every file and cuts it up. Files that cannot be read are skipped, and said so in ``skipped``.
+
+    At most ``crops`` clouds in all. Raises FmrError where nothing is left to train on.
+    """
+    each = int(np.clip(crops // len(files), 1, CROPS_OF_A_SCAN))
+    rng = np.random.default_rng(seed)
+    clouds: list[np.ndarray] = []
+    scan: list[int] = []
+    skipped: list[str] = []
+    for i, path in enumerate(files):
+        progress(i, len(files))
+        try:
+            points = read_cloud(path, attributes=False, mesh_points=4 * cloud_points).points
+        except FmrError as error:
+            skipped.append(str(error))
+            continue
+        cut = crops_of(points, each, cloud_points, rng)
+        if not cut:
+            skipped.append(f"{path}: too small, {len(points)} points where {SMALLEST} are needed")
+        clouds += cut
+        scan += [i] * len(cut)
+        if len(clouds) >= crops:
+            break
+    progress(len(files), len(files))
+    if not clouds:
+        raise FmrError(f"nothing to train on in {len(files)} files; the first: {skipped[0]}")
+    return Material(np.stack(clouds), np.array(scan), files, skipped)
+
+
+def crops_of(points: np.ndarray, count: int, cloud_points: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """The whole scan and ``count`` - 1 balls around random points of it: (cloud_points, 3) float32 each, normalised."""
+    points = points - np.median(points, 0)
+    reach = float(np.quantile(np.linalg.norm(points, axis=1), 0.9))
+    if not reach > 0:
+        return []
+    found = []
+    for attempt in range(1 + TRIES * (count - 1)):
+        if len(found) == count:
+            break
+        radius, inside = reach, points[np.linalg.norm(points, axis=1) <= 1.5 * reach]
+        if attempt:
+            radius = reach * np.exp(rng.uniform(*np.log(RADII)))
+            inside = points[np.linalg.norm(points - points[rng.integers(len(points))], axis=1) < radius]
+        if len(inside) < SMALLEST:
+            continue
+        thin = voxel_downsample(inside, radius / GRID)
+        if len(thin) < SMALLEST:
+            thin = inside  # a sparse scan: its own points, as they are
+        found.append(to_size(thin, cloud_points, rng))
+    return found
+
+
+def to_size(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` of the points (N, 3) in random order, repeated where N is smaller; normalised, float32."""
+    points = sample(points, count, rng)
+    points = points[np.concatenate([rng.permutation(len(points)) for _ in range(-(-count // len(points)))])[:count]]
+    points = points - points.mean(0)
+    return (points * (0.5 / np.abs(points).max())).astype(np.float32)
+
+
+def load_pairs(path: Path, cloud_points: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Labelled pairs of a CSV file (source, target, transform; paths relative to it): two arrays (S, M, 3), float32.
+
+    The source is moved onto its target; both are centred on the target and scaled as one. Raises FmrError.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file, skipinitialspace=True))
+    except FileNotFoundError:
+        raise FmrError(f"{path}: no such file; give a CSV with the columns source, target, transform") from None
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise FmrError(f"{path}: is no CSV file ({error}); check how it was written") from None
+    if not rows or not {"source", "target", "transform"} <= set(rows[0]):
+        raise FmrError(f"{path}: needs a first line with the columns source, target, transform, and a line a pair")
+    rng = np.random.default_rng(seed)
+    sources, targets = [], []
+    for number, row in enumerate(rows, 2):
+        if not all(row[name] for name in ("source", "target", "transform")):
+            raise FmrError(f"{path}: line {number} lacks source, target or transform; fill it in")
+        T = read_transform(path.parent / row["transform"])
+        source, target = (read_cloud(path.parent / row[name], attributes=False).points for name in ("source", "target"))
+        both = []
+        edge = np.ptp(target, axis=0).max() / (2 * GRID)
+        for points in (transform_points(T, source), target):
+            thin = voxel_downsample(points, edge)
+            some = sample(thin if len(thin) >= SMALLEST else points, cloud_points, rng)
+            both.append(some[np.resize(rng.permutation(len(some)), cloud_points)])
+        centre, size = both[1].mean(0), np.abs(both[1] - both[1].mean(0)).max()
+        for list_, points in zip((sources, targets), both, strict=True):
+            list_.append(((points - centre) * (0.5 / size)).astype(np.float32))
+    return np.stack(sources), np.stack(targets)
