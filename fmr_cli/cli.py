@@ -233,6 +233,43 @@ def train_command(
     train(scans or [], chosen, out, err, pairs=pairs, minutes=minutes, resume=resume, device=device, quiet=quiet)
 
 
+@app.command("evaluate")
+def evaluate_command(
+    scans: Annotated[
+        list[Path], typer.Argument(help="Folders of scans or meshes; each is a set of its own.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="For results.csv and plots.")] = Path("evaluation"),
+    experiments: Annotated[
+        str, typer.Option(help="Comma-separated: rotation, density, noise, overlap, scenes, features.")
+    ] = "rotation,density,noise,overlap,scenes,features",
+    model: Annotated[
+        list[Path] | None,
+        typer.Option(help="Weights to evaluate; again for more. [default: the bundled ones]", show_default=False),
+    ] = None,
+    with_baselines: Annotated[
+        bool, typer.Option("--baselines", help="LM-ICP, small_gicp, and FPFH + RANSAC, KISS-Matcher where installed.")
+    ] = False,
+    clouds: Annotated[int | None, typer.Option(help="Of each set, at most. [default: all]", min=1)] = None,
+    pairs: Annotated[int, typer.Option(help="Random pairs at each level.", min=1)] = 100,
+    points: Annotated[int, typer.Option(help="Of each cloud.", min=16)] = 1024,
+    iterations: Annotated[int, typer.Option(help="Of the solver.", min=1)] = 10,
+    plain: Annotated[bool, typer.Option("--plain/--no-plain", help="The paper's plain least squares as well.")] = True,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same pairs.", min=0)] = 0,
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where the encoder runs.")] = "auto",
+) -> None:
+    """The paper's experiments on SCANS: errors by initial rotation, density, noise, overlap, as tables, CSV and plots.
+
+    The solver alone from the identity, without the search over starts and the polish of `fmr align`. Both clouds are
+    centred on their means; lengths are in units of the cloud (its largest extent about 1).
+    """
+    from fmr_cli.evaluation.command import evaluate
+
+    evaluate(
+        scans, out, [name.strip() for name in experiments.split(",")], model or [], with_baselines, clouds, pairs,
+        points, iterations, plain, seed, device, Console(highlight=False), say,
+    )  # fmt: skip
+
+
 def say(text: str) -> None:
     """A line for a person, on stderr."""
     err.print(text, markup=False)

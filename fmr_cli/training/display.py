@@ -103,9 +103,10 @@ def verdict(trainer: Trainer, stopped: bool) -> str:
     where = f"{trainer.out / MODEL}"
     if progress.best == 0:
         return f"{how}training made it no better than its start; {where} holds the start"
-    before, after = trainer.mean_success(0), trainer.mean_success(progress.best)
+    (before, off), (after, now) = trainer.quality(0), trainer.quality(progress.best)
     return (
-        f"{how}held-out success {before:.3f} at the start, {after:.3f} at epoch {progress.best}, which is kept: {where}"
+        f"{how}held-out success {before:.3f} at the start, {after:.3f} at epoch {progress.best}, which is kept "
+        f"(mean error, at most 30 each: {-off:.2f} deg before, {-now:.2f} now): {where}"
     )
 
 

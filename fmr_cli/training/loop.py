@@ -34,6 +34,7 @@ from fmr_cli.training.recipe import Recipe, read_recipe
 RAMP = 100  # steps over which the learning rate rises from zero
 LAST_RATE = 0.01  # of the learning rate, where its cosine ends
 MARGIN = 0.97  # of the minutes that were asked for are planned
+os.umask(UMASK := os.umask(0))
 TIMED = 20  # steps whose time the plan rests on
 
 MODEL, STATE, RECIPE, METRICS, CARD = (
@@ -301,6 +302,7 @@ class Trainer:
                 save(temporary)
             except SafetensorError as error:
                 raise OSError(str(error)) from None
+            os.chmod(temporary, 0o666 & ~UMASK)  # safetensors makes files that only their owner can read
 
     def write_metrics(self, row: dict[str, Any]) -> None:
         """One more row, in a file that is whole at any time; rows from after a resumed state go."""

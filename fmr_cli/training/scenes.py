@@ -34,9 +34,15 @@ class Scene:
         """Distance along each unit direction (N, 3) to the first surface seen from origin (3,), FAR where there is none."""
         nearest = np.full(len(directions), FAR)
         for kind, A in zip(self.kinds, self.maps, strict=True):
+            # Only rays that meet the solid's bounding sphere are worth the exact test.
+            towards, radius2 = A[:3, 3] - origin, (A[:3, :3] ** 2).sum()
+            along = directions @ towards
+            rays = np.flatnonzero(
+                (along > 0) & (along**2 > towards @ towards - radius2) | (towards @ towards < radius2)
+            )
             inverse = np.linalg.inv(A)
-            o, d = inverse[:3, :3] @ origin + inverse[:3, 3], directions @ inverse[:3, :3].T
-            nearest = np.minimum(nearest, _HIT[kind](o, d))
+            o, d = inverse[:3, :3] @ origin + inverse[:3, 3], directions[rays] @ inverse[:3, :3].T
+            nearest[rays] = np.minimum(nearest[rays], _HIT[kind](o, d))
         return nearest
 
 
@@ -173,7 +179,9 @@ def lidar_rays(rotation: Rotation, beams: int = 64, columns: int = 900) -> np.nd
     return rotation.apply(rays.reshape(-1, 3))
 
 
-def scan(scene: Scene, origin: np.ndarray, rays: np.ndarray, rng: np.random.Generator, noise: float, reach: float) -> np.ndarray:
+def scan(
+    scene: Scene, origin: np.ndarray, rays: np.ndarray, rng: np.random.Generator, noise: float, reach: float
+) -> np.ndarray:
     """World points (n, 3) that the rays from origin hit within reach, with Gaussian range noise; 2 % of them are lost."""
     distance = scene.cast(origin, rays)
     seen = (distance < reach) & (rng.random(len(rays)) > 0.02)
