@@ -178,8 +178,9 @@ def transform_command(
     """Move FILE by a saved TRANSFORM and write it in any format."""
     import numpy as np
 
-    from fmr_cli import io
+    from fmr_cli import io, outputs
 
+    outputs.check_outputs([(out, io.WRITABLE)])
     T = io.read_transform(transform)
     warnings = io.write_cloud(out, io.read_cloud(file).transformed(np.linalg.inv(T) if inverse else T))
     for warning in [] if quiet else warnings:

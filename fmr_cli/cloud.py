@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 NORMALS = ("nx", "ny", "nz")
+PULSE = ("x_t", "y_t", "z_t")  # the direction of a LAS waveform, in coordinates per picosecond
 
 
 @dataclass
@@ -67,14 +68,15 @@ class PointCloud:
     def transformed(self, T: np.ndarray) -> PointCloud:
         """The cloud moved by T (4x4, float64, rigid or with a uniform scale s): x -> s R x + t.
 
-        Normals are rotated, not scaled; the sensor's position moves along.
+        Normals are rotated, not scaled; LAS pulse directions and the sensor's position move along.
         """
         moved = replace(self, points=transform_points(T, self.points), attributes=dict(self.attributes))
         scale = np.cbrt(np.linalg.det(T[:3, :3]))
-        if all(name in self.attributes for name in NORMALS):
-            normals = np.stack([self.attributes[name] for name in NORMALS], 1).astype(np.float64) @ T[:3, :3].T / scale
-            for axis, name in enumerate(NORMALS):
-                moved.attributes[name] = normals[:, axis].astype(self.attributes[name].dtype)
+        for names, block in ((NORMALS, T[:3, :3] / scale), (PULSE, T[:3, :3])):
+            if all(name in self.attributes for name in names):
+                vectors = np.stack([self.attributes[name] for name in names], 1).astype(np.float64) @ block.T
+                for axis, name in enumerate(names):
+                    moved.attributes[name] = vectors[:, axis].astype(self.attributes[name].dtype)
         if self.las_header is not None and abs(scale - 1) > 1e-6:
             moved.las_header = self.las_header.copy()
             moved.las_header.scales = self.las_header.scales * scale  # as many steps across the cloud as before

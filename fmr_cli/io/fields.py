@@ -165,7 +165,7 @@ def write_records(file: BinaryIO, cloud: PointCloud, dtype: np.dtype, columns: M
 
 
 class Lines:
-    """The lines of a text file with the number of the last one handed out."""
+    """The lines of a text file that are not blank, and the number of the last one handed out."""
 
     def __init__(self, lines: Iterator[str], number: int = 0) -> None:
         self.lines, self.number, self.last = lines, number, ""
@@ -174,9 +174,11 @@ class Lines:
         return self
 
     def __next__(self) -> str:
-        self.last = next(self.lines)
-        self.number += 1
-        return self.last
+        for line in self.lines:
+            self.last, self.number = line, self.number + 1
+            if not line.isspace():
+                return line
+        raise StopIteration
 
 
 def read_table(
@@ -197,7 +199,7 @@ def read_table(
     if rows == 0:
         return np.empty(0, dtype)
     # numpy prints a warning where there is nothing at all to read
-    first = next((line for line in lines if (line.split(comments)[0] if comments else line).strip()), None)
+    first = next((line for line in lines if not comments or line.split(comments)[0].strip()), None)
     if first is None:
         if rows:
             raise CloudFileError(f"promises {rows} points and holds none, it is truncated: copy it again")

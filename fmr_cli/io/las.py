@@ -11,6 +11,7 @@ from typing import Any
 import laspy
 import lazrs
 import numpy as np
+from laspy.point.dims import WAVEFORM_FIELDS_NAMES
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
 from fmr_cli.cloud import PointCloud
@@ -73,9 +74,11 @@ def read(path: Path, attributes: bool) -> PointCloud:
     # What `write` could not put into the 16 bits of LAS's own intensity
     if "Intensity" in kept and not kept["intensity"].any() and kept["Intensity"].ndim == 1:
         kept["intensity"] = kept.pop("Intensity")
-    waveform = header.global_encoding.waveform_data_packets_internal
-    left_out = ("waveform packets",) if waveform else ()
-    return PointCloud(joined(points), kept, crs=crs_of(header), las_header=header, left_out=left_out)
+    left_out = ["waveform packets"] if header.global_encoding.waveform_data_packets_internal else []
+    if header.are_points_compressed and garbled_waveforms(header, kept):
+        kept = {name: values for name, values in kept.items() if name not in WAVEFORM_FIELDS_NAMES}
+        left_out.append("waveform fields (lazrs garbles them where there are several scanner channels)")
+    return PointCloud(joined(points), kept, crs=crs_of(header), las_header=header, left_out=tuple(left_out))
 
 
 def check_header(path: Path) -> None:
@@ -146,6 +149,12 @@ def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
     file.seek(header.offset_to_point_data)
 
 
+def garbled_waveforms(header: laspy.LasHeader, columns: dict[str, np.ndarray]) -> bool:
+    """lazrs (0.8) mixes up the wave packet fields of point formats 9 and 10 between the scanner's channels."""
+    channels = columns.get("scanner_channel")
+    return header.point_format.id in (9, 10) and channels is not None and bool((channels != channels[0]).any())
+
+
 def joined(parts: list[np.ndarray]) -> np.ndarray:
     """The parts as one array; each is freed as soon as it is copied."""
     whole = np.empty((sum(map(len, parts)), *parts[0].shape[1:]), parts[0].dtype)
@@ -176,8 +185,12 @@ def write(path: Path, cloud: PointCloud) -> list[str]:
     """LAS or LAZ by the suffix; keeps the cloud's LAS header where it has one, else makes a 1.4 header."""
     header, warnings = header_for(cloud)
     columns = place_attributes(header, cloud, warnings)
+    compress = path.suffix.lower() == ".laz"
+    if compress and garbled_waveforms(header, columns) and "wavepacket_index" in columns:
+        columns = {name: values for name, values in columns.items() if name not in WAVEFORM_FIELDS_NAMES}
+        warnings.append("the waveform fields are left out, LAZ does not keep them for several channels: write .las")
     header.scales, header.offsets = scaling(cloud, warnings)
-    with laspy.open(path, "w", header=header, do_compress=path.suffix.lower() == ".laz") as writer:
+    with laspy.open(path, "w", header=header, do_compress=compress) as writer:
         for start in range(0, len(cloud), CHUNK):
             part = slice(start, start + CHUNK)
             points = cloud.points[part]
@@ -268,7 +281,10 @@ def place_attributes(header: laspy.LasHeader, cloud: PointCloud, warnings: list[
 
 
 def split(attributes: dict[str, np.ndarray], warnings: list[str]) -> dict[str, np.ndarray]:
-    """Attributes in types that LAS knows; (N, k) ones with k > 3 become k of their own."""
+    """Attributes in types that LAS knows; (N, k) ones with k > 3 become k of their own.
+
+    Up to 7 single bytes may stay together; laspy does not read back the declaration of more.
+    """
     result: dict[str, np.ndarray] = {}
     for name, values in attributes.items():
         if values.dtype.kind not in "biuf":
@@ -282,7 +298,7 @@ def split(attributes: dict[str, np.ndarray], warnings: list[str]) -> dict[str, n
             values = values.reshape(len(values), int(np.prod(values.shape[1:])))
             if values.shape[1] == 1:
                 values = values[:, 0]
-            elif values.shape[1] > 3 and values.dtype != np.uint8:
+            elif values.shape[1] > (7 if values.dtype == np.uint8 else 3):
                 result |= {f"{name}_{k}": values[:, k] for k in range(values.shape[1])}
                 warnings.append(f"attribute {name!r} is written as {name}_0 to {name}_{values.shape[1] - 1}")
                 continue

@@ -135,7 +135,7 @@ def read_compressed(file: BinaryIO, header: Header) -> np.ndarray:
     if len(sizes) < 8:
         raise damaged
     packed, unpacked = struct.unpack("<II", sizes)
-    data = file.read(packed)
+    data = file.read()[:packed]
     if len(data) < packed or unpacked != total:
         raise damaged
     plain = lzf.decompress(data, unpacked) if unpacked else b""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -159,13 +160,9 @@ def read_text(lines: Lines, element: Element) -> dict[str, Any]:
         records = read_table(lines, element.dtype(""), element.count)
         return {p.name: records[p.name] for p in element.properties}
     columns: dict[str, list] = {p.name: [] for p in element.properties}
-    row = 0
-    for line in lines:
+    rows = 0
+    for line in islice(lines, element.count):
         words = iter(line.split())
-        if not line.strip():
-            continue
-        if row == element.count:
-            break
         try:
             for p in element.properties:
                 number = float if p.type[0] == "f" else int
@@ -175,11 +172,9 @@ def read_text(lines: Lines, element: Element) -> dict[str, Any]:
                     columns[p.name].append(number(next(words)))
         except (ValueError, StopIteration, RuntimeError):
             raise CloudFileError(f"line {lines.number}: is no {element.name!r}: {line.strip()[:60]!r}") from None
-        row += 1
-        if row == element.count:
-            break
-    if row < element.count:
-        raise CloudFileError(f"promises {element.count} of {element.name!r} and ends after {row}: copy it again")
+        rows += 1
+    if rows < element.count:
+        raise CloudFileError(f"promises {element.count} of {element.name!r} and ends after {rows}: copy it again")
     return finish(element, columns)
 
 
