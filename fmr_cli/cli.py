@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -58,11 +59,12 @@ def align_command(
     outputs.check_outputs([
         (out, (".txt", ".npy", ".json")), (aligned, io.WRITABLE), (merged, io.WRITABLE), (metrics, (".json",)),
     ])  # fmt: skip
-    moving = io.read_cloud(source, attributes=bool(aligned or merged))
-    fixed = io.read_cloud(target, attributes=bool(merged))
-    from fmr_cli.registration import Options, align  # after reading: a bad file is said at once, before torch is there
+    with busy(f"registering {source.name} onto {target.name}", quiet):
+        moving = io.read_cloud(source, attributes=bool(aligned or merged))
+        fixed = io.read_cloud(target, attributes=bool(merged))
+        from fmr_cli.registration import Options, align  # after reading: a bad file is said at once, before torch is in
 
-    found = align(moving, fixed, Options(**options))
+        found = align(moving, fixed, Options(**options))
     T, said, warnings = found.T_target_source, outputs.metrics(moving, fixed, found), [*found.warnings]
     if aligned:
         warnings += io.write_cloud(aligned, outputs.aligned_cloud(moving, fixed, T))
@@ -269,6 +271,11 @@ def evaluate_command(
         scans, out, [name.strip() for name in experiments.split(",")], model or [], with_baselines, clouds, pairs,
         points, iterations, plain, seed, device, Console(highlight=False), say,
     )  # fmt: skip
+
+
+def busy(text: str, quiet: bool) -> AbstractContextManager:
+    """A sign of life on a terminal while its block runs."""
+    return err.status(text) if err.is_terminal and not quiet else nullcontext()
 
 
 def say(text: str) -> None:
