@@ -55,22 +55,27 @@ def read(path: Path, attributes: bool) -> PointCloud:
             for k, name in enumerate(unique([d.name for d in dimensions])):
                 dimensions[k] = dimensions[k]._replace(name=name)
             names = [d.name for d in dimensions if d.name not in "XYZ"] if attributes else []
-            points: list[np.ndarray] = []
-            columns: dict[str, list[np.ndarray]] = {name: [] for name in names}
+            points = np.empty((header.point_count, 3))
+            kept: dict[str, np.ndarray] = {}
+            done = 0
             for chunk in reader.chunk_iterator(CHUNK):
-                points.append(np.stack([chunk[axis] for axis in "XYZ"], 1) * header.scales + header.offsets)
+                part = slice(done, done + len(chunk))
+                for i, axis in enumerate("XYZ"):
+                    points[part, i] = chunk[axis] * header.scales[i] + header.offsets[i]
                 for name in names:
-                    columns[name].append(np.array(chunk[name]))
-            count = sum(map(len, points))
-            if count != header.point_count:
-                raise CloudFileError(f"promises {header.point_count} points and holds {count}: copy it again")
+                    values = np.asarray(chunk[name])
+                    if done == 0:
+                        kept[name] = np.empty((len(points), *values.shape[1:]), values.dtype)
+                    kept[name][part] = values
+                done += len(chunk)
+            if done != len(points):
+                raise CloudFileError(f"promises {len(points)} points and holds {done}: copy it again")
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # what lazrs raises on some damaged files is no Exception
             raise
         raise CloudFileError("has damaged compressed data: copy it again") from error
-    if not points:
+    if len(points) == 0:
         raise CloudFileError("holds no points (its header says 0), check how it was written")
-    kept = {name: joined(columns.pop(name)) for name in names}
     # What `write` could not put into the 16 bits of LAS's own intensity
     if "Intensity" in kept and not kept["intensity"].any() and kept["Intensity"].ndim == 1:
         kept["intensity"] = kept.pop("Intensity")
@@ -78,7 +83,7 @@ def read(path: Path, attributes: bool) -> PointCloud:
     if header.are_points_compressed and garbled_waveforms(header, kept):
         kept = {name: values for name, values in kept.items() if name not in WAVEFORM_FIELDS_NAMES}
         left_out.append("waveform fields (lazrs garbles them where there are several scanner channels)")
-    return PointCloud(joined(points), kept, crs=crs_of(header), las_header=header, left_out=tuple(left_out))
+    return PointCloud(points, kept, crs=crs_of(header), las_header=header, left_out=tuple(left_out))
 
 
 def check_header(path: Path) -> None:
@@ -153,17 +158,6 @@ def garbled_waveforms(header: laspy.LasHeader, columns: dict[str, np.ndarray]) -
     """lazrs (0.8) mixes up the wave packet fields of point formats 9 and 10 between the scanner's channels."""
     channels = columns.get("scanner_channel")
     return header.point_format.id in (9, 10) and channels is not None and bool((channels != channels[0]).any())
-
-
-def joined(parts: list[np.ndarray]) -> np.ndarray:
-    """The parts as one array; each is freed as soon as it is copied."""
-    whole = np.empty((sum(map(len, parts)), *parts[0].shape[1:]), parts[0].dtype)
-    end = len(whole)
-    while parts:
-        part = parts.pop()
-        whole[end - len(part) : end] = part
-        end -= len(part)
-    return whole
 
 
 def crs_of(header: laspy.LasHeader) -> str | None:
