@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ from fmr_cli.io.fields import (
 
 LONGEST_HEADER = 1 << 20
 PCL_NAMES = {f"n{axis}": f"normal_{axis}" for axis in "xyz"}
+RESTS = ("x_rest", "y_rest", "z_rest")
+NOTABLE = 1e-5  # a rounding that is worth a warning, as a share of the cloud's extent
 LZF_LIMIT = 90  # LZF cannot shrink data more than this many times
 
 
@@ -62,7 +65,9 @@ def read(path: Path, attributes: bool) -> PointCloud:
             records = np.fromfile(file, header.fields, header.points)
         else:
             records = read_compressed(file, header)
-    columns = {name: records[name] for name in header.fields.names or () if not name.startswith("_")}
+    columns = {name: records[name] for name in header.fields.names or () if not re.fullmatch(r"_(_\d+)?", name)}
+    if {*"xyz", *RESTS} <= set(columns):
+        columns |= {axis: columns[axis] + columns.pop(rest) for axis, rest in zip("xyz", RESTS, strict=True)}
     cloud = to_cloud(unpack_colors(columns) if attributes else columns, attributes)
     if header.viewpoint and np.isfinite(header.viewpoint).all():
         cloud.sensor_origin = np.array(header.viewpoint[:3])
@@ -164,12 +169,24 @@ def unpack_colors(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, cloud: PointCloud) -> list[str]:
-    """DATA binary, coordinates as F 8; 8-bit colours packed, everything else in its own type."""
+    """DATA binary; 8-bit colours packed, everything else in its own type.
+
+    PCL and Open3D know float32 coordinates only (Open3D takes F 8 for zeros), so x y z are F 4; where that rounds them,
+    what is missing stands in the fields x_rest y_rest z_rest, and `read` adds it again.
+    """
     columns, warnings = flat_columns(pack_colors(eight_bit_colors(cloud.attributes)), split=False)
     columns = {name: storable(values, long_integers=True) for name, values in columns.items()}
+    with np.errstate(over="ignore", invalid="ignore"):
+        rest = cloud.points - cloud.points.astype(np.float32)
+    coordinate = "<f4" if np.isfinite(rest).all() else "<f8"
+    if coordinate == "<f4" and rest.any():
+        columns |= {name: rest[:, i] for i, name in enumerate(RESTS)}
+        if np.abs(rest).max() > NOTABLE * np.ptp(cloud.points, axis=0).max():
+            error = np.abs(rest).max()
+            warnings.append(f"most readers of PCD take float32 only and will round coordinates by up to {error:.2g}")
     counts = {name: values[0].size for name, values in columns.items()}
     dtype = np.dtype(
-        [(axis, "<f8") for axis in "xyz"] + [(n, "<" + v.dtype.str[1:], v.shape[1:]) for n, v in columns.items()]
+        [(axis, coordinate) for axis in "xyz"] + [(n, "<" + v.dtype.str[1:], v.shape[1:]) for n, v in columns.items()]
     )
     names = dtype.names or ()
     types = [dtype[name].base for name in names]

@@ -46,7 +46,8 @@ def same(a: PointCloud, b: PointCloud) -> bool:
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz"])
 def test_everything_comes_back_bit_for_bit(tmp_path: Path, cloud: PointCloud, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
-    assert write_cloud(path, cloud) == []
+    warnings = write_cloud(path, cloud)
+    assert ["will round coordinates by up to 0.25" in w for w in warnings] == [True] * (suffix == ".pcd")
     back = read_cloud(path)
     assert np.array_equal(back.points, cloud.points)
     order = sorted(cloud.attributes)
@@ -191,7 +192,9 @@ def test_pcd_encodings_and_packed_colours(tmp_path: Path, kind: str, color: str)
     assert [cloud.attributes[c].tolist() for c in ("red", "green", "blue")] == [[10, 0, 64], [11, 0, 255], [12, 1, 0]]
     assert cloud.attributes["hist"].tolist() == [[1, 2], [3, 4], [5, 6]]
     assert cloud.sensor_origin.tolist() == [1, 2, 3]
-    assert write_cloud(tmp_path / "b.pcd", cloud) == []
+    write_cloud(tmp_path / "b.pcd", cloud)
+    assert b"\nFIELDS x y z hist rgb x_rest" in (tmp_path / "b.pcd").read_bytes()
+    assert np.array_equal(read_cloud(tmp_path / "b.pcd").points, cloud.points)
     assert same(read_cloud(tmp_path / "b.pcd"), PointCloud(cloud.points, {
         name: cloud.attributes[name] for name in ("hist", "red", "green", "blue")
     }))  # fmt: skip
@@ -273,6 +276,16 @@ def test_a_ply_with_an_empty_face_element_is_a_cloud(tmp_path: Path) -> None:
     text = mesh_text(".ply").decode().replace("element face 6", "element face 0")
     (tmp_path / "a.ply").write_text(text)
     assert read_cloud(tmp_path / "a.ply").points.tolist() == CUBE
+
+
+def test_a_pcd_of_float32_is_written_as_one(tmp_path: Path) -> None:
+    cloud = PointCloud(np.array([[0.1, 2, 3], [1, 2, 80]], np.float32))
+    assert write_cloud(tmp_path / "a.pcd", cloud) == []
+    assert b"FIELDS x y z\nSIZE 4 4 4\n" in (tmp_path / "a.pcd").read_bytes()
+    assert np.array_equal(read_cloud(tmp_path / "a.pcd").points, cloud.points)
+    far = PointCloud(cloud.points * 1e300)
+    write_cloud(tmp_path / "b.pcd", far)
+    assert np.array_equal(read_cloud(tmp_path / "b.pcd").points, far.points)
 
 
 def test_an_attribute_of_several_numbers_is_split_with_a_warning(tmp_path: Path) -> None:
