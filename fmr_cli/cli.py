@@ -145,6 +145,62 @@ def batch_command(
         raise typer.Exit(UNCERTAIN)
 
 
+@app.command("sequence")
+def sequence_command(
+    scans: Annotated[
+        Path,
+        typer.Argument(help="A folder of scans, a KITTI sequence or drive, a .txt that lists scans.", show_default=False),
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="The poses, each frame to the first, in the sensor's frame.")
+    ],
+    form: Annotated[Literal["kitti", "tum", "json"], typer.Option("--format", help="Of the poses.")] = "kitti",
+    camera_frame: Annotated[
+        bool, typer.Option("--camera-frame", help="Poses of the camera, by calib.txt, as KITTI's own truth.")
+    ] = False,
+    residuals: Annotated[Path | None, typer.Option(help="A CSV row a frame: status, residuals, seconds.")] = None,
+    merged: Annotated[Path | None, typer.Option(help="The map: a point a voxel, its attributes and frame.")] = None,
+    merged_voxel: Annotated[
+        float | None, typer.Option(help="The map's voxel edge. [default: half the working one]", min=0.0)
+    ] = None,
+    voxel_size: Annotated[
+        float | None, typer.Option(help="The working voxel edge. [default: by the data]", min=0.0)
+    ] = None,
+    start: Annotated[int, typer.Option(help="The first scan, counted from 0.", min=0)] = 0,
+    stop: Annotated[int | None, typer.Option(help="The scan before which to stop. [default: the last]", min=0)] = None,
+    step: Annotated[int, typer.Option(help="Take every so many-th scan.", min=1)] = 1,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where a stopped run has left off.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+) -> None:
+    """Register every scan of a sequence into the frame of the first."""
+    from fmr_cli import io, outputs
+    from fmr_cli.scans import find_scans
+    from fmr_cli.sequence import Sequence, live
+
+    outputs.check_outputs([(out, (out.suffix.lower(),)), (residuals, (".csv",)), (merged, io.WRITABLE)])
+    found = find_scans(scans, start, stop, step, [path for path in (out, residuals, merged) if path])
+    for note in [] if quiet else found.notes:
+        say(note)
+    sequence = Sequence(
+        found, out, form=form, camera_frame=camera_frame, residuals=residuals, merged=merged,
+        merged_voxel=merged_voxel or None, voxel_size=voxel_size or None,
+    )  # fmt: skip
+    done = sequence.open(resume)
+    with live(err, done, len(found.files), err.is_terminal and not quiet) as show:
+        for row in sequence.run():
+            show(row)
+            if "message" in row and not quiet:
+                say(f"frame {row['frame']} is bridged: {row['message']}")
+    for line in [] if quiet else sequence.summary():
+        say(line)
+    if sequence.uncertain:
+        if not quiet:
+            names = ", ".join(f"{row['frame']} ({row['file']})" for row in sequence.uncertain[:20])
+            more = len(sequence.uncertain) - 20
+            say(f"{len(sequence.uncertain)} uncertain, look at: {names}{f' and {more} more' if more > 0 else ''}")
+        raise typer.Exit(UNCERTAIN)
+
+
 @app.command("info")
 def info_command(
     files: Annotated[list[Path], typer.Argument(help="Clouds or meshes.", show_default=False)],

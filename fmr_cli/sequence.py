@@ -1,0 +1,334 @@
+"""A folder of scans in; a trajectory, a table of residuals and a map out. Written frame by frame, resumable.
+
+What is needed to go on after a kill is in a journal beside the poses: a header, then a line a frame. It is removed at
+the end.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TextIO
+
+import numpy as np
+
+import fmr_cli
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
+from fmr_cli.io import read_cloud, write_cloud
+from fmr_cli.io.files import atomic_write, check_readable, reason
+from fmr_cli.odometry import Frame, Odometry, Scan, choose_voxel
+from fmr_cli.scans import Scans
+from fmr_cli.voxel_map import GrowingMap
+
+Format = Literal["kitti", "tum", "json"]
+AHEAD = 2  # scans that are read and thinned while one is registered
+ODD_SIZE = 10.0  # a scan so many times larger or smaller than the usual is not of this sequence
+COLUMNS = (
+    "frame", "file", "status", "start", "points", "overlap", "inlier_rmse", "feature_error_before",
+    "feature_error_after", "motion", "rotation_deg", "read_s", "prepare_s", "register_s", "message",
+)  # fmt: skip
+
+
+@dataclass
+class Loaded:
+    """A scan as it came from its file: thinned, or None with a message that says why it cannot be used."""
+
+    scan: Scan | None
+    cloud: PointCloud | None
+    size: float
+    row: dict[str, Any]
+
+
+class Sequence:
+    """One run over the scans of a sequence.
+
+    out: the poses. residuals: a CSV row a frame. merged: the map, of voxels of ``merged_voxel`` (half the working
+    voxel where None). camera_frame: poses of the camera that ``calib.txt`` tells of. voxel_size: the working voxel,
+    file units, or None: taken from the first scan.
+    Raises FmrError where the options ask for what the sequence does not have.
+    """
+
+    def __init__(
+        self, scans: Scans, out: Path, *, form: Format = "kitti", camera_frame: bool = False,
+        residuals: Path | None = None, merged: Path | None = None, merged_voxel: float | None = None,
+        voxel_size: float | None = None,
+    ) -> None:  # fmt: skip
+        if camera_frame and scans.T_camera_scan is None:
+            raise FmrError(f"{scans.files[0].parent}: no calib.txt with a line Tr, leave out --camera-frame")
+        self.scans, self.out, self.form, self.residuals = scans, out, form, residuals
+        self.T_camera_scan = scans.T_camera_scan if camera_frame else None
+        self.merged, self.merged_voxel, self.voxel_size = merged, merged_voxel, voxel_size
+        self.journal = out.with_name(out.name + ".journal")
+        self.rows: list[dict[str, Any]] = []
+        self.poses: list[np.ndarray] = []  # this frame to the first, file units
+        self.sizes: deque[float] = deque(maxlen=15)
+
+    def open(self, resume: bool) -> int:
+        """Make ready; returns how many frames an earlier run has done. Raises FmrError where its settings differ."""
+        records = self._read_journal() if resume else []
+        if records:
+            header, *lines = records
+            self.odometry = Odometry(header["voxel"], np.array(header["origin"]))
+            poses = [np.array(line["T"]) for line in lines]
+            self.rows = [line["row"] for line in lines]
+            self.poses = [self.odometry.to_file(T) for T in poses]
+            self.sizes.extend(line["size"] for line in lines if line["size"])
+            if lines:
+                self.odometry.restore(lines[-1]["state"], poses, lambda index: self._scan_again(index))
+        else:
+            first = self._read_first()
+            voxel = self.voxel_size or choose_voxel(first)
+            self.odometry = Odometry(voxel, np.median(first, axis=0))
+            lines = []
+        settings = self._settings() | {"voxel": self.odometry.voxel, "origin": self.odometry.origin.tolist()}
+        self.map = GrowingMap(self.merged_voxel or self.odometry.voxel / 2) if self.merged else None
+        with atomic_write(self.journal) as part:
+            part.write_text("".join(json.dumps(record) + "\n" for record in [settings, *lines]), "utf-8")
+        for index, row in enumerate(self.rows):
+            if self.map and row["status"] == "aligned":
+                self.map.add(read_cloud(self.scans.files[index]), self.poses[index], index)
+        return len(self.rows)
+
+    def run(self) -> Iterator[dict[str, Any]]:
+        """Register what is left; yields a row a frame once it is in the files."""
+        start = len(self.rows)
+        with ThreadPoolExecutor(1) as reader, self.journal.open("a", encoding="utf-8") as journal:
+            tables = self._open_tables()
+            waiting: deque[Future[Loaded]] = deque()
+            try:
+                for index in range(start, len(self.scans.files)):
+                    for ahead in range(index + len(waiting), min(index + AHEAD + 1, len(self.scans.files))):
+                        waiting.append(reader.submit(self._load, ahead))
+                    row = self._step(index, waiting.popleft().result(), journal)
+                    for table, line in zip(tables, self._lines(index), strict=True):
+                        table.write(line)
+                        table.flush()
+                    yield row
+            finally:
+                for future in waiting:
+                    future.cancel()
+                for table in tables:
+                    table.close()
+        self._finish()
+
+    def _step(self, index: int, loaded: Loaded, journal: TextIO) -> dict[str, Any]:
+        begin = time.perf_counter()
+        row = loaded.row
+        scan = None if self._odd(loaded, row) else loaded.scan
+        try:
+            frame = self.odometry.register(scan)
+        except RegistrationError as error:
+            raise RegistrationError(f"{self.scans.files[index]}: {error}") from None
+        self.poses.append(frame.pose)
+        self.rows.append(row)
+        row |= self._described(frame, begin)
+        if self.map and frame.status == "aligned" and loaded.cloud is not None:
+            self.map.add(loaded.cloud, frame.pose, index)
+        record = {
+            "row": row, "size": loaded.size, "T": self.odometry.poses[-1].tolist(), "state": self.odometry.state(),
+        }  # fmt: skip
+        journal.write(json.dumps(record) + "\n")
+        journal.flush()
+        return row
+
+    def _odd(self, loaded: Loaded, row: dict[str, Any]) -> bool:
+        """Whether the scan is of quite another size than those before it, most often one in another unit."""
+        usual = float(np.median(self.sizes)) if self.sizes else loaded.size
+        ratio = loaded.size / usual if loaded.size and usual else 1.0
+        odd = not 1 / ODD_SIZE < ratio < ODD_SIZE
+        if odd:
+            row["message"] = f"{ratio:.3g} times the size of the scans before it, is it in another unit?"
+            loaded.size = 0.0
+        elif loaded.size:
+            self.sizes.append(loaded.size)
+        return odd
+
+    def _described(self, frame: Frame, begin: float) -> dict[str, Any]:
+        before = self.poses[-2] if len(self.poses) > 1 else frame.pose
+        motion = np.linalg.inv(before) @ frame.pose
+        said: dict[str, Any] = {"status": frame.status, "start": frame.start, "overlap": round(frame.overlap, 4)}
+        if math.isfinite(frame.inlier_rmse):
+            said["inlier_rmse"] = float(f"{frame.inlier_rmse:.6g}")
+        if frame.feature_errors:
+            said["feature_error_before"], said["feature_error_after"] = (
+                float(f"{e:.6g}") for e in frame.feature_errors
+            )
+        said["motion"] = float(f"{np.linalg.norm(motion[:3, 3]):.6g}")
+        said["rotation_deg"] = float(f"{rotation_degrees(motion):.6g}")
+        said["register_s"] = round(time.perf_counter() - begin, 4)
+        return said
+
+    def _load(self, index: int) -> Loaded:
+        """Read and thin one scan; runs beside the registration of the one before."""
+        path = self.scans.files[index]
+        row: dict[str, Any] = {"frame": index, "file": path.name, "points": 0}
+        begin = time.perf_counter()
+        try:
+            cloud = read_cloud(path, attributes=bool(self.merged))
+        except CloudFileError as error:
+            return Loaded(None, None, 0.0, row | {"message": str(error)})
+        row["points"], row["read_s"] = len(cloud), round(time.perf_counter() - begin, 4)
+        begin = time.perf_counter()
+        scan = self.odometry.prepare(cloud.points)
+        if scan is None:
+            row["message"] = f"{path}: only {len(cloud)} points, too few to register"
+        size = float(np.abs(scan.points).mean()) if scan else 0.0
+        row["prepare_s"] = round(time.perf_counter() - begin, 4)
+        return Loaded(scan, cloud if self.merged else None, size, row)
+
+    def _scan_again(self, index: int) -> Scan:
+        scan = self._load(index).scan
+        if scan is None:
+            raise FmrError(f"{self.scans.files[index]}: cannot be read again, it has changed; leave out --resume")
+        return scan
+
+    def _read_first(self) -> np.ndarray:
+        try:
+            return read_cloud(self.scans.files[0], attributes=False).points
+        except CloudFileError as error:
+            raise CloudFileError(f"{error}; or leave this first scan out with --start") from None
+
+    def _settings(self) -> dict[str, Any]:
+        """What must be the same in the run that is resumed."""
+        return {
+            "version": fmr_cli.__version__,
+            "files": [str(path) for path in self.scans.files],
+            "voxel_size": self.voxel_size,
+        }
+
+    def _read_journal(self) -> list[dict[str, Any]]:
+        """The header and the whole lines of an earlier run's journal; empty where there is none."""
+        if not self.journal.exists():
+            return []
+        check_readable(self.journal)
+        records = []
+        for line in self.journal.read_bytes().split(b"\n")[:-1]:  # what follows the last newline was cut off
+            try:
+                records.append(json.loads(line))
+            except ValueError as error:
+                raise FmrError(f"{self.journal}: is damaged ({reason(error)}), leave out --resume") from None
+        changed = [name for name, value in self._settings().items() if records and records[0].get(name) != value]
+        if changed:
+            raise FmrError(
+                f"{self.journal}: was begun with other settings ({', '.join(changed)}), use those or leave out --resume"
+            )
+        return records
+
+    def _open_tables(self) -> list[TextIO]:
+        """Poses and residuals, holding what an earlier run has done, open for more."""
+        tables: list[TextIO] = []
+        for path, head, kind in self._tables():
+            with atomic_write(path) as part:
+                part.write_text(head + "".join(self._line(kind, i) for i in range(len(self.rows))), "utf-8")
+            tables.append(path.open("a", encoding="utf-8", newline=""))
+        return tables
+
+    def _tables(self) -> list[tuple[Path, str, str]]:
+        tables = [(self.out, "", self.form)] if self.form != "json" else []
+        return tables + ([(self.residuals, ",".join(COLUMNS) + "\n", "csv")] if self.residuals else [])
+
+    def _lines(self, index: int) -> list[str]:
+        return [self._line(kind, index) for _, _, kind in self._tables()]
+
+    def _line(self, kind: str, index: int) -> str:
+        if kind == "csv":
+            return csv_line([self.rows[index].get(name, "") for name in COLUMNS])
+        pose = self.pose(index)
+        if kind == "kitti":
+            return " ".join(f"{value + 0.0:.17g}" for value in pose[:3].ravel()) + "\n"
+        time_of = float(index) if self.scans.times is None else self.scans.times[index]
+        values = [*pose[:3, 3], *quaternion(pose[:3, :3])]
+        return f"{time_of:.9f} " + " ".join(f"{value + 0.0:.17g}" for value in values) + "\n"
+
+    def pose(self, index: int) -> np.ndarray:
+        """(4, 4): a frame to the first, in the frame that the poses are written in."""
+        pose = self.poses[index]
+        return pose if self.T_camera_scan is None else self.T_camera_scan @ pose @ np.linalg.inv(self.T_camera_scan)
+
+    def _finish(self) -> None:
+        if self.form == "json":
+            frames = [
+                {**row, "pose": self.pose(i).tolist()}
+                | ({} if self.scans.times is None else {"time": self.scans.times[i]})
+                for i, row in enumerate(self.rows)
+            ]
+            with atomic_write(self.out) as part:
+                part.write_text(
+                    json.dumps({"version": fmr_cli.__version__, "frames": frames}, indent=1) + "\n", "utf-8"
+                )
+        if self.map and self.merged:
+            write_cloud(self.merged, self.map.cloud())
+        self.journal.unlink(missing_ok=True)
+
+    def summary(self) -> list[str]:
+        """What a person wants to know at the end, a line each."""
+        length = sum(row["motion"] for row in self.rows)
+        residuals = [row["inlier_rmse"] for row in self.rows[1:] if "inlier_rmse" in row]
+        lines = [f"{len(self.rows)} frames, path length {length:.6g}, voxel {self.odometry.voxel:g}: {self.out}"]
+        if residuals:
+            worst = max(self.rows[1:], key=lambda row: row.get("inlier_rmse", 0.0))
+            lines.append(
+                f"residual: median {np.median(residuals):.4g}, "
+                f"worst {worst['inlier_rmse']:.4g} in frame {worst['frame']} ({worst['file']})"
+            )
+        return lines
+
+    @property
+    def uncertain(self) -> list[dict[str, Any]]:
+        """The rows of the frames that are not to be trusted."""
+        return [row for row in self.rows if row["status"] != "aligned"]
+
+
+@contextmanager
+def live(console: Any, done: int, total: int, shown: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A line on a terminal that says how far a run is; yields the function that takes each new row."""
+    if not shown:
+        yield lambda row: None
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    begin, length = time.perf_counter(), 0.0
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("starting", total=total, completed=done)
+
+        def show(row: dict[str, Any]) -> None:
+            nonlocal length
+            length += row["motion"]
+            rate = (row["frame"] + 1 - done) / (time.perf_counter() - begin)
+            said = f"{rate:.1f} frames/s, {row['status']}, path {length:.4g}"
+            progress.update(task, advance=1, description=said)
+
+        yield show
+
+
+def csv_line(cells: list[Any]) -> str:
+    """One line of a CSV file."""
+    import io
+
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(cells)
+    return text.getvalue()
+
+
+def rotation_degrees(T: np.ndarray) -> float:
+    """The angle of a pose's rotation."""
+    R = T[:3, :3]
+    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.degrees(np.arctan2(sine, np.trace(R) - 1)))
+
+
+def quaternion(R: np.ndarray) -> np.ndarray:
+    """(x, y, z, w) of a rotation matrix, w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(R).as_quat(canonical=True)
