@@ -149,7 +149,7 @@ def batch_command(
 def sequence_command(
     scans: Annotated[
         Path,
-        typer.Argument(help="A folder of scans, a KITTI sequence or drive, a .txt that lists scans.", show_default=False),
+        typer.Argument(help="A folder of scans, a KITTI sequence or drive, or a list (.txt).", show_default=False),
     ],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="The poses, each frame to the first, in the sensor's frame.")
