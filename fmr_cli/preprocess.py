@@ -6,15 +6,16 @@ length here by it and changes nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 WORKING_VOXELS = 5000  # the voxel edge is chosen so that about so many are occupied
-SAMPLE = 40_000  # points that the choice of the voxel edge looks at
+SAMPLE = 15_000  # points that the choice of the voxel edge looks at
 HALF_EXTENT = 0.5  # of a normalised cloud, as the encoder was trained
 NORMAL_NEIGHBOURS = 16
+SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
 
 
 def voxel_downsample(points: np.ndarray, edge: float) -> np.ndarray:
@@ -26,9 +27,13 @@ def voxel_downsample(points: np.ndarray, edge: float) -> np.ndarray:
 
 def occupied_voxels(points: np.ndarray, edge: float) -> int:
     """How many voxels of the given edge hold a point."""
-    cells = np.floor((points - points.min(0)) / edge).astype(np.int64)
-    size = cells.max(0) + 1
-    return len(np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]))
+    return len(np.unique(cell_numbers(points, edge)))
+
+
+def cell_numbers(points: np.ndarray, edge: float) -> np.ndarray:
+    """The voxel that each point lies in, as one number: (N, 3) -> (N,) int64."""
+    x, y, z = (np.floor((c - c.min()) / edge).astype(np.int64) for c in points.T)
+    return (x * (y.max() + 1) + y) * (z.max() + 1) + z
 
 
 def sample(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -47,33 +52,23 @@ def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, 
     nearest = cKDTree(some).query(sample(some, 2000, rng), 2)[0][:, 1]
     spacing = float(np.median(nearest)) * np.sqrt(len(some) / max(len(points), len(some)))
     low, high = spacing / 4, float(np.ptp(some, axis=0).max())
-    for _ in range(14):
+    for _ in range(10):
         middle = np.sqrt(low * high)
         low, high = (middle, high) if occupied_voxels(some, middle) > WORKING_VOXELS else (low, middle)
     return high, spacing
 
 
-def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (M, 3), their sign undetermined, and the surface variation (M,), from the nearest 16 points.
+def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined, surface variation (M,), and reach (M,).
 
-    The surface variation is the smallest eigenvalue of the neighbourhood's covariance over their sum (Pauly 2002).
+    The surface variation is the smallest eigenvalue of the neighbourhood's covariance over their sum (Pauly 2002), 0 on
+    a plane, 1/3 where it is round; the reach is the distance to the last of the 16.
     """
-    k = min(NORMAL_NEIGHBOURS, len(points))
-    neighbours = points[tree.query(points, k)[1]]
+    distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
+    neighbours = points[index]
     centred = neighbours - neighbours.mean(1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
-    return vectors[:, :, 0], values[:, 0] / np.maximum(values.sum(1), 1e-300)
-
-
-@dataclass(frozen=True)
-class Normalisation:
-    """x -> (x - centre) / scale, and its exact inverse on poses. centre: (3,) own unit; scale: own unit per unit box."""
-
-    centre: np.ndarray
-    scale: float
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        return (points - self.centre) / self.scale
+    return vectors[:, :, 0], values[:, 0] / np.maximum(values.sum(1), 1e-300), distance[:, -1]
 
 
 class Surface:
@@ -83,14 +78,24 @@ class Surface:
         self.edge = edge
         self.points = voxel_downsample(points, edge)
         self.tree = cKDTree(self.points)
-        self.normals, self.variation = normals_and_variation(self.points, self.tree)
+
+    @cached_property
+    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return normals_and_variation(self.points, self.tree)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(M, 3) unit normals of undetermined sign."""
+        return self._shape[0]
 
     def keypoints(self, count: int) -> np.ndarray:
-        """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``."""
-        order = np.argsort(-self.variation, kind="stable")
-        cells = np.floor((self.points[order] - self.points.min(0)) / (2 * self.edge)).astype(np.int64)
-        size = cells.max(0) + 1
-        first = np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_index=True)[1]
+        """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.
+
+        Where neighbours are far, as in a LiDAR's outskirts, variation is chance: such points come last.
+        """
+        _, variation, reach = self._shape
+        order = np.argsort(-np.where(reach < SPARSE * self.edge, variation, 0.0), kind="stable")
+        first = np.unique(cell_numbers(self.points[order], 2 * self.edge), return_index=True)[1]
         return order[np.sort(first)[:count]]
 
     def patches(self, index: np.ndarray, radius: float, neighbours: int) -> dict[str, np.ndarray]:

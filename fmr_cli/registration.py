@@ -7,18 +7,28 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 
 import fmr_cli
-from fmr_cli.cloud import PointCloud
+from fmr_cli import polish, verdict
+from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.errors import FmrError
+from fmr_cli.feature_metric.motion import Dof, Motion
+from fmr_cli.pair import Candidate, Pair, Prepared, Start
+from fmr_cli.weights import bundled_local_encoder, encoder
 
 Init = Literal["auto", "search", "features", "centroid", "identity"]
+REFINED = 3  # starts that are refined, of each kind
+SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
+DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
+AS_GOOD = 0.5  # of the best one's odds: an alternative worth telling
 
 
 @dataclass(frozen=True)
@@ -28,19 +38,22 @@ class Options:
     voxel_size: the working voxel edge, or None.
     normalize: scale the clouds to the encoder's unit box (half extent 0.5); without it they are taken to be so scaled.
     points: how many points of each cloud the global encoder sees.
-    init: where to start: "auto", "search" (rotations spread over SO(3)), "features" (matched local patches),
-        "centroid", "identity", or a 4x4 T_target_source.
-    iterations: of the IC solver, at most.
+    init: where to start: "auto" (cheap starts first, more while the verdict is not sure), "search" (rotations spread
+        over SO(3)), "features" (matched local patches), "centroid", "identity", or a 4x4 T_target_source.
+    iterations: of the IC solver from a given start, at most.
     robust: robust weights, or the paper's plain least squares.
     refine: finish with a geometric polish (GICP).
     model: the global encoder's weights (.safetensors), or None for the bundled ones.
-    device: "auto", "cpu" or "cuda".
+    device: "auto", "cpu" or "cuda": where the global encoder runs.
     seed: of every random choice; the same seed gives the same answer.
+    dof: "rigid", "yaw" (rotation about ``up``, any translation), "translation", "planar" (yaw, and no shift along up).
+    up: the vertical, any length. scale: also estimate one scale factor.
+    max_angle: degrees; max_shift: how far the source's centre may move. Poses beyond are not considered.
     """
 
     voxel_size: float | None = None
     normalize: bool = True
-    points: int = 2048
+    points: int = 1024
     init: Init | np.ndarray = "auto"
     iterations: int = 10
     robust: bool = True
@@ -48,21 +61,32 @@ class Options:
     model: Path | None = None
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
+    dof: Dof = "rigid"
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    scale: bool = False
+    max_angle: float | None = None
+    max_shift: float | None = None
 
 
 @dataclass
 class Registration:
     """A transform and everything said about it.
 
-    T_target_source: (4, 4) float64, x_target = R x_source + t, in the clouds' own unit.
+    T_target_source: (4, 4) float64, x_target = s R x_source + t, in the clouds' own unit; s is 1 unless asked for.
     status: "aligned", or "uncertain" where the evidence at the pose speaks against it.
     confidence: the probability, from 0 to 1, that the pose is right.
     overlap: share of the smaller cloud's points that have a counterpart in the other one.
     inlier_rmse: root mean square distance of those counterparts, own unit.
-    feature_errors: mean |F(g Q) - F(P)| before each iteration of the solver and after the last.
+    feature_error_before, feature_error_after: mean |F(g Q) - F(P)| of the global feature as the files are, and at T.
+    feature_errors: the same before each iteration of the IC solver that led to T, and after its last; empty where T
+        came from local features.
     start: which start the pose came from ("identity", "centroid", "search", "features", "given").
-    angle: rotation angle of T, degrees; shift: length of its translation, own unit.
-    points: points read and points used, by cloud. seconds: wall time by stage, with their "total".
+    angle: rotation angle of T, degrees. shift: how far T moves the source's centre, own unit.
+    information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's mean;
+        rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.
+    undetermined: the directions that the scans hardly determine, in words.
+    alternatives: other poses that fit about as well, best first: T_target_source, confidence, feature_error.
+    evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage and in total.
     """
 
     T_target_source: np.ndarray
@@ -70,44 +94,47 @@ class Registration:
     confidence: float
     overlap: float
     inlier_rmse: float
+    feature_error_before: float
+    feature_error_after: float
     feature_errors: list[float]
     start: str
+    angle: float
+    shift: float
+    scale: float
+    information: np.ndarray
+    covariance: np.ndarray
+    origin: np.ndarray
+    undetermined: list[str]
+    alternatives: list[dict[str, Any]]
+    evidence: dict[str, float]
     voxel_size: float
     points: dict[str, int]
     seconds: dict[str, float]
     options: Options
     warnings: list[str] = field(default_factory=list)
 
-    @property
-    def angle(self) -> float:
-        R = self.T_target_source[:3, :3]
-        return float(np.degrees(np.arctan2(np.linalg.norm(_vee(R)), np.trace(R) - 1)))
-
-    @property
-    def shift(self) -> float:
-        return float(np.linalg.norm(self.T_target_source[:3, 3]))
-
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON types, with the versions it was made by."""
-        said = {name: value for name, value in vars(self).items() if name != "options"}
-        options = asdict(self.options)
-        options["init"] = options["init"] if isinstance(options["init"], str) else np.asarray(options["init"]).tolist()
-        options["model"] = str(options["model"]) if options["model"] else None
-        said |= {
-            "T_target_source": self.T_target_source.tolist(),
-            "angle_deg": self.angle,
-            "shift": self.shift,
-            "iterations": max(len(self.feature_errors) - 1, 0),
-            "options": options,
-            "versions": versions(),
-        }
+        said = {name: _plain(value) for name, value in vars(self).items() if name != "options"}
+        options = {name: _plain(value) for name, value in asdict(self.options).items()}
+        said |= {"iterations": max(len(self.feature_errors) - 1, 0), "options": options, "versions": versions()}
         return said
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not np.isfinite(value):
+        return None  # JSON has no infinity
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def versions() -> dict[str, str]:
     """What could change a result: this tool, torch, numpy, Python and the processor's architecture."""
-    import torch
-
     return {
         "fmr": fmr_cli.__version__,
         "torch": torch.__version__,
@@ -117,53 +144,207 @@ def versions() -> dict[str, str]:
     }
 
 
-def _vee(R: np.ndarray) -> np.ndarray:
-    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-
-
-class Prepared:
-    """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once."""
-
-    def __init__(self, cloud: PointCloud) -> None:
-        self.cloud = cloud
-
-
-def prepare(cloud: PointCloud) -> Prepared:
+def prepare(cloud: PointCloud, seed: int = 0) -> Prepared:
     """Check a cloud and make it ready. Raises RegistrationError: fewer than 10 distinct points, all in one place."""
-    return Prepared(cloud)
+    return Prepared(cloud, seed)
 
 
 @contextmanager
 def stage(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Adds the wall time of its block to ``seconds[name]``."""
     start = time.perf_counter()
     yield
     seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-def align(
-    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options()
-) -> Registration:
+def align(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options()) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
-    Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or the device.
+    A pair is worked on by one thread, so that the answer is the same bit for bit wherever it is asked for; many pairs
+    run side by side. Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or
+    the device, FmrError for options that contradict each other.
     """
-    import small_gicp
-
+    if torch.get_num_threads() != 1:
+        torch.set_num_threads(1)
     seconds: dict[str, float] = {}
-    start = time.perf_counter()
-    source = source if isinstance(source, Prepared) else prepare(source)
-    target = target if isinstance(target, Prepared) else prepare(target)
-    with stage(seconds, "refine"):
-        extent = float(np.ptp(target.cloud.points, axis=0).max())
-        origin = target.cloud.points.mean(0)
-        found = small_gicp.align(
-            target.cloud.points - origin, source.cloud.points - origin, downsampling_resolution=extent / 100,
-            max_correspondence_distance=extent / 10,
-        )  # fmt: skip
-        T = found.T_target_source.copy()
-        T[:3, 3] += origin - T[:3, :3] @ origin
-    seconds["total"] = time.perf_counter() - start
-    return Registration(
-        T, "aligned", 1.0, 1.0, 0.0, [0.0], "identity", extent / 100,
-        {"source": len(source.cloud), "target": len(target.cloud)}, seconds, options,
+    begin = time.perf_counter()
+    with stage(seconds, "prepare"):
+        source = source if isinstance(source, Prepared) else prepare(source, options.seed)
+        target = target if isinstance(target, Prepared) else prepare(target, options.seed)
+    best: tuple[Pair, float, list[Candidate]] | None = None
+    for factor in scale_factors(source, target) if options.scale else (1.0,):
+        scaled = source if factor == 1.0 else source.scaled(factor)
+        pair = make_pair(scaled, target, options)
+        candidates = find(pair, options, seconds)
+        if options.refine or options.scale:
+            with stage(seconds, "polish"):
+                candidates[0] = pair.polished(candidates[0], options.scale)
+        if best is None or candidates[0].confidence > best[2][0].confidence:
+            best = pair, factor, candidates
+    assert best is not None
+    found = describe(*best, source, options, seconds)
+    seconds["total"] = time.perf_counter() - begin
+    return found
+
+
+def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
+    """The two clouds at their common voxel edge, with the encoders and the motions that the options ask for."""
+    up = np.asarray(options.up, float)
+    if not np.isfinite(up).all() or np.linalg.norm(up) == 0:
+        raise FmrError(f"--up {options.up}: is no direction; give three numbers, not all zero")
+    up /= np.linalg.norm(up)
+    motion = Motion(
+        options.dof, (float(up[0]), float(up[1]), float(up[2])), float(up @ (source.centre - target.centre))
+    )
+    return Pair(
+        source, target, encoder(options.model, options.device), bundled_local_encoder(), motion,
+        voxel_size=options.voxel_size, normalize=options.normalize, points=options.points,
+        iterations=options.iterations, robust=options.robust, seed=options.seed,
     )  # fmt: skip
+
+
+def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candidate]:
+    """Candidates, best first, from the starts that the options name; "auto" goes on while the verdict is not aligned."""
+    candidates: list[Candidate] = []
+    for name, starts in start_makers(pair, options):
+        with stage(seconds, name):
+            ranked = sorted(
+                (s for s in starts() if within_bounds(s.T, pair, options)), key=lambda s: -pair.coincidence(s.T)
+            )
+        with stage(seconds, "refine"):
+            candidates += [pair.candidate(start) for start in ranked[:REFINED]]
+        candidates = [c for c in candidates if within_bounds(c.T, pair, options)]
+        candidates.sort(key=lambda c: -c.confidence)
+        if candidates and candidates[0].confidence >= verdict.ALIGNED:
+            break
+    if not candidates:  # every pose found lies beyond --max-angle or --max-shift
+        here = local_pose(np.eye(4), pair)
+        candidates = [Candidate(here, "identity", [], verdict.gather(pair.s, pair.t, here, float("nan")))]
+    return distinct(candidates, pair.edge)
+
+
+def start_makers(pair: Pair, options: Options) -> list[tuple[str, Callable[[], list[Start]]]]:
+    """The kinds of start to try, in order: (stage, function)."""
+    if not isinstance(options.init, str):
+        given = local_pose(np.asarray(options.init, float), pair)
+        return [("solve", lambda: pair.from_pose(given, "given"))]
+    if options.init in ("identity", "centroid"):
+        name = options.init
+        here = local_pose(np.eye(4), pair) if name == "identity" else np.eye(4)
+        return [("solve", lambda: pair.from_pose(here, name))]
+    makers: list[tuple[str, Callable[[], list[Start]]]] = [
+        ("features", pair.from_features),
+        ("search", pair.from_search),
+    ]
+    return [maker for maker in makers if options.init in ("auto", maker[0])]
+
+
+def local_pose(T: np.ndarray, pair: Pair) -> np.ndarray:
+    """T between the files' coordinates -> between the clouds' local frames."""
+    local = T.copy()
+    local[:3, 3] = transform_points(T, pair.source.centre[None])[0] - pair.target.centre
+    return local
+
+
+def file_pose(T: np.ndarray, pair: Pair) -> np.ndarray:
+    """T between the local frames -> between the files' coordinates."""
+    out = T.copy()
+    out[:3, 3] = T[:3, 3] + pair.target.centre - T[:3, :3] @ pair.source.centre
+    return out
+
+
+def within_bounds(T: np.ndarray, pair: Pair, options: Options) -> bool:
+    """Whether a local pose keeps to --max-angle and --max-shift."""
+    shift = np.linalg.norm(T[:3, 3] + pair.target.centre - pair.source.centre)
+    return (options.max_angle is None or angle_degrees(T) <= options.max_angle) and (
+        options.max_shift is None or bool(shift <= options.max_shift)
+    )
+
+
+def distinct(candidates: list[Candidate], edge: float) -> list[Candidate]:
+    """The candidates without those that are another, better one's pose."""
+    kept: list[Candidate] = []
+    for c in candidates:
+        apart = (
+            angle_degrees(np.linalg.inv(c.T) @ k.T) > DISTINCT_DEGREES
+            or np.linalg.norm(c.T[:3, 3] - k.T[:3, 3]) > DISTINCT_EDGES * edge
+            for k in kept
+        )
+        if all(apart):
+            kept.append(c)
+    return kept
+
+
+def describe(
+    pair: Pair,
+    factor: float,
+    candidates: list[Candidate],
+    source: Prepared,
+    options: Options,
+    seconds: dict[str, float],
+) -> Registration:
+    """The best candidate in the files' coordinates, with its covariance and alternatives.
+
+    factor: what the source was multiplied by before it became pair.source.
+    """
+    best, others = candidates[0], candidates[1:]
+    with stage(seconds, "verdict"):
+        T = file_pose(best.T, pair)
+        T[:3, :3] *= factor
+        scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
+        info = polish.information(pair.s, pair.t, best.T, np.zeros(3))
+        length = pair.length / 2
+        weak = polish.undetermined(info, length)
+        odds = best.confidence / max(1 - best.confidence, 1e-12)
+        alternatives = [
+            {
+                "T_target_source": file_pose(c.T, pair).tolist(),
+                "confidence": c.confidence,
+                "feature_error": pair.feature_error(c.T),
+            }
+            for c in others
+            if c.confidence / max(1 - c.confidence, 1e-12) >= AS_GOOD * odds
+        ]
+        before, after = pair.feature_error(local_pose(np.eye(4), pair)), pair.feature_error(best.T)
+    return Registration(
+        T_target_source=T,
+        status="aligned" if best.confidence >= verdict.ALIGNED else "uncertain",
+        confidence=best.confidence,
+        overlap=best.evidence.overlap,
+        inlier_rmse=best.evidence.inlier_rmse,
+        feature_error_before=before,
+        feature_error_after=after,
+        feature_errors=best.errors,
+        start=best.start,
+        angle=angle_degrees(T),
+        shift=float(np.linalg.norm(transform_points(T, source.centre[None])[0] - source.centre)),
+        scale=scale,
+        information=info,
+        covariance=np.linalg.pinv(info, rcond=1e-12, hermitian=True),
+        origin=pair.target.centre,
+        undetermined=weak,
+        alternatives=alternatives,
+        evidence=asdict(best.evidence),
+        voxel_size=pair.edge,
+        points={
+            "source": source.read,
+            "target": pair.target.read,
+            "source_used": len(pair.s.points),
+            "target_used": len(pair.t.points),
+        },
+        seconds=seconds,
+        options=options,
+    )
+
+
+def angle_degrees(T: np.ndarray) -> float:
+    """The rotation angle of T's (scaled) rotation, degrees."""
+    R = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
+    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.degrees(np.arctan2(sine, np.trace(R) - 1)))
+
+
+def scale_factors(source: Prepared, target: Prepared) -> list[float]:
+    """Scales to try: about the ratio of the root mean square sizes, and about that of the surfaces' voxel edges."""
+    sizes = float(np.sqrt((target.points**2).sum(1).mean() / (source.points**2).sum(1).mean()))
+    return [sizes * s for s in SCALES]

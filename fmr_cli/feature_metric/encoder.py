@@ -34,14 +34,17 @@ class Encoder(nn.Module):
             x = torch.relu(layer(x))
         return self.layers[-1](x)
 
-    def forward(self, points: Tensor) -> Tensor:
-        """F of every cloud: (B, N, 3) -> (B, K)."""
-        return self.pointwise(points).amax(-2)
+    def forward(self, points: Tensor, chunk: int = 2048) -> Tensor:
+        """F of every cloud: (B, N, 3) -> (B, K). A running maximum keeps the B x N x K activation in cache."""
+        feature = self.pointwise(points[:, :chunk]).amax(-2)  # without the index, nearly twice as fast as max
+        for first in range(chunk, points.shape[1], chunk):
+            feature = torch.maximum(feature, self.pointwise(points[:, first : first + chunk]).amax(-2))
+        return feature
 
     def encode(self, points: Tensor, chunk: int = 2048) -> tuple[Tensor, Tensor]:
         """F with the critical points: (B, N, 3) -> feature (B, K), index (B, K) of the point that set each channel.
 
-        A running maximum over chunks keeps the B x N x K activation in cache; the result is that of ``forward``.
+        The feature is that of ``forward``.
         """
         feature, index = self.pointwise(points[:, :chunk]).max(-2)
         for first in range(chunk, points.shape[1], chunk):
@@ -54,15 +57,30 @@ class Encoder(nn.Module):
     def critical_gradients(self, points: Tensor, index: Tensor) -> Tensor:
         """df_k/dp at the critical point of each channel: points (B, N, 3), index (B, K) -> (B, K, 3).
 
-        Three tangents go forward through the MLP for one point a channel; the last layer takes only its own row.
+        Channel k goes back through the MLP from its own row of the last layer, at its own point.
         """
         x = points.gather(1, index[..., None].expand(-1, -1, 3))  # [B x K x 3]
-        tangent = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:2], 3, 3)  # [B x K x (d/dx_i) x width]
+        return chain(list(self.layers), self.active(x))
+
+    def active(self, x: Tensor) -> list[Tensor]:
+        """Which units of each hidden layer are on at points (..., 3): a list of (..., width)."""
+        on = []
         for layer in self.layers[:-1]:
             x = layer(x)
-            tangent = (tangent @ layer.weight.T) * (x > 0)[..., None, :]
+            on.append(x > 0)
             x = torch.relu(x)
-        return torch.einsum("bkiw,kw->bki", tangent, self.layers[-1].weight)
+        return on
+
+
+def chain(layers: list[nn.Module], on: list[Tensor]) -> Tensor:
+    """Rows of the product W_n D_(n-1) W_(n-1) ... D_1 W_1, D the layers' 0/1 masks ``on`` (B, K, width): (B, K, 3).
+
+    Row k of the last matrix goes with the masks of channel k's own point.
+    """
+    row = layers[-1].weight  # [K x width]
+    for layer, mask in zip(reversed(layers[:-1]), reversed(on), strict=True):
+        row = (row * mask) @ layer.weight
+    return row
 
 
 def jacobian(encoder: Encoder, points: Tensor, index: Tensor) -> Tensor:

@@ -21,7 +21,9 @@ CHANNELS = 10
 class LocalEncoder(nn.Module):
     """(K, PATCH_POINTS, CHANNELS) patches -> (K, 32) unit descriptors."""
 
-    def __init__(self, point_widths: tuple[int, ...] = (64, 128, 256), head_widths: tuple[int, ...] = (128, 32)) -> None:
+    def __init__(
+        self, point_widths: tuple[int, ...] = (64, 128, 128), head_widths: tuple[int, ...] = (128, 32)
+    ) -> None:
         super().__init__()
         self.point_widths, self.head_widths = tuple(point_widths), tuple(head_widths)
         self.point = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((CHANNELS, *point_widths)))

@@ -65,7 +65,7 @@ def make_template(encoder: Encoder, target: Tensor, method: Literal["exact", "fi
 def finite_jacobian(encoder: Encoder, target: Tensor, feature: Tensor, step: float = FINITE_STEP) -> Tensor:
     """J by the paper's forward difference, (F(exp(-step e_i) P) - F(P)) / step: (B, N, 3), (B, K) -> (B, K, 6)."""
     twists = -step * torch.eye(6, dtype=target.dtype, device=target.device)
-    columns = [encoder.encode(se3.transform(se3.exp(twist), target))[0] - feature for twist in twists]
+    columns = [encoder(se3.transform(se3.exp(twist), target)) - feature for twist in twists]
     return torch.stack(columns, -1) / step
 
 
@@ -76,23 +76,25 @@ def solve(
     g: Tensor,
     iterations: int = 10,
     robust: bool = True,
+    basis: Tensor | None = None,
 ) -> Solution:
     """Iterate from g (B, 4, 4) on source (B, N, 3); the template's batch is B, or 1 and shared by all.
 
+    basis: (6, d) orthonormal twists that the motion may use; None for all six.
     Stops early once no step of the batch exceeds ``STOP_STEP``.
     """
     errors = []
     g = g.clone()
     for iteration in range(iterations):
-        r = encoder.encode(se3.transform(g, source))[0] - template.feature
+        r = encoder(se3.transform(g, source)) - template.feature
         errors.append(r.abs().mean(-1))
         fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * iteration / max(iterations - 1, 1)
         weight = geman_mcclure(r, fall) if robust else torch.ones_like(r)
-        step = weighted_step(template.J, weight, r)
+        step = weighted_step(template.J, weight, r, basis)
         g = se3.exp(step) @ g
         if float(step.abs().max()) < STOP_STEP:
             break
-    r = encoder.encode(se3.transform(g, source))[0] - template.feature
+    r = encoder(se3.transform(g, source)) - template.feature
     errors.append(r.abs().mean(-1))
     return Solution(g, torch.stack(errors), template.rank.expand(len(g)))
 
@@ -103,17 +105,25 @@ def geman_mcclure(r: Tensor, factor: float) -> Tensor:
     return (s2 / (s2 + r * r)).square()
 
 
-def weighted_step(J: Tensor, weight: Tensor, r: Tensor) -> Tensor:
-    """The capped step dtheta of (JᵀWJ) dtheta = JᵀW r: J (B or 1, K, 6), weight and r (B, K) -> (B, 6).
-
-    Solved in float64 by eigenvectors; directions that J does not see get no step, rather than a huge one.
-    """
+def weighted_step(J: Tensor, weight: Tensor, r: Tensor, basis: Tensor | None = None) -> Tensor:
+    """The capped step dtheta of (JᵀWJ) dtheta = JᵀW r: J (B or 1, K, 6), weight and r (B, K) -> (B, 6)."""
     WJ = weight[..., None] * J
-    A = (J.mT @ WJ).double()
-    b = (WJ.mT @ r[..., None]).double()
-    eigenvalues, V = torch.linalg.eigh(A)
-    seen = eigenvalues > RANK_TOLERANCE * eigenvalues[:, -1:].clamp_min(1e-30)
+    step = constrained_step((J.mT @ WJ).double(), (WJ.mT @ r[..., None])[..., 0].double(), basis)
+    return capped(step, MAX_STEP).to(r.dtype)
+
+
+def constrained_step(A: Tensor, b: Tensor, basis: Tensor | None) -> Tensor:
+    """The step of A dtheta = b, (..., 6, 6) and (..., 6) float64, within the span of basis (6, d).
+
+    By eigenvectors: directions that A does not see get no step, rather than a huge one.
+    """
+    B = torch.eye(6, dtype=A.dtype, device=A.device) if basis is None else basis.to(A)
+    eigenvalues, V = torch.linalg.eigh(B.mT @ A @ B)
+    seen = eigenvalues > RANK_TOLERANCE * eigenvalues[..., -1:].clamp_min(1e-30)
     inverse = torch.where(seen, 1 / eigenvalues.clamp_min(1e-30), 0.0)
-    step = (V @ (inverse[..., None] * (V.mT @ b)))[..., 0]
-    size = step.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-    return (step * (MAX_STEP / size).clamp_max(1.0)).to(r.dtype)
+    return (B @ (V @ (inverse[..., None] * (V.mT @ (B.mT @ b[..., None])))))[..., 0]
+
+
+def capped(step: Tensor, size: float) -> Tensor:
+    """The step (..., 6), shortened where its norm exceeds ``size``."""
+    return step * (size / step.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1.0)

@@ -5,6 +5,7 @@ The scenes know where both scanners stood, so every keypoint of one scan has its
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import sys
 import time
@@ -144,3 +145,18 @@ def held_out_rank1(model: LocalEncoder, views: Views) -> float:
     """How often the nearest descriptor among the other scan's is of the same place (within APART)."""
     best = (model(views.source) @ model(views.target).T).argmax(1)
     return float(((views.place[best] - views.place).norm(dim=1) < APART).float().mean())
+
+
+def main(out: str, pairs: int = 320, steps: int = 1600, seed: int = 0) -> None:
+    """``python -m fmr_cli.training.local models/local.safetensors``: the bundled local encoder, from nothing but code."""
+    from safetensors.torch import save_file
+
+    material = make_material(pairs, seed, workers=multiprocessing.cpu_count())
+    torch.set_num_threads(1)
+    model = train(material, steps, seed)
+    widths = {"point_widths": list(model.point_widths), "head_widths": list(model.head_widths)}
+    save_file(model.state_dict(), out, metadata={"architecture": json.dumps(widths)})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,281 @@
+"""The steps of one registration: two prepared clouds, where a pose may start, how it is refined and judged.
+
+Poses here are 4x4 between the clouds' local frames (each about its own mean); ``registration.align`` puts the steps in
+order and translates to the files' coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fmr_cli import polish, verdict
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import RegistrationError
+from fmr_cli.feature_metric.consensus import consensus, match
+from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
+from fmr_cli.feature_metric.motion import Motion
+from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
+from fmr_cli.feature_metric.search import STARTS, search
+from fmr_cli.feature_metric.solver import make_template, solve
+from fmr_cli.preprocess import Surface, sample, voxel_downsample, working_scale
+
+MIN_POINTS = 10
+KEYPOINTS = 500
+CONSENSUS_TOLERANCE = 2.0  # voxel edges
+CONSENSUS_POSES = 5
+RANKING_POINTS = 800
+LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; the polish does the rest
+FINE = LEVELS[
+    1:
+]  # enough from matched features, which are within CONSENSUS_TOLERANCE; its residual goes to the verdict
+PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
+POLISH_TARGET, POLISH_SOURCE = 24_000, 8_000
+LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
+
+
+class Prepared:
+    """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once.
+
+    points: (N, 3) float64 about ``centre`` (the mean), finite and distinct. edge: the voxel edge that suits this cloud;
+    spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one place.
+    """
+
+    def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
+        points = np.unique(cloud.points[np.isfinite(cloud.points).all(1)], axis=0)
+        if len(points) == 1 and len(cloud) > 1:
+            raise RegistrationError(f"{cloud.name}: all {len(cloud)} points are in one place; give a scan of a surface")
+        if len(points) < MIN_POINTS:
+            raise RegistrationError(
+                f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
+            )
+        self.name, self.read, self.seed = cloud.name, len(cloud), seed
+        self.centre = points.mean(0)
+        self.points = points - self.centre
+        self.edge, self.spacing = working_scale(self.points, np.random.default_rng(seed))
+        self._surfaces: dict[float, Surface] = {}
+        self._described: dict[float, tuple[np.ndarray, Tensor]] = {}
+        self._gicp: dict[tuple[int, float], polish.GicpCloud] = {}
+
+    def scaled(self, factor: float) -> Prepared:
+        """The same cloud with every length multiplied by ``factor``."""
+        return Prepared(PointCloud((self.points + self.centre) * factor), self.seed)
+
+    def surface(self, edge: float) -> Surface:
+        """The cloud on a voxel grid of ``edge``, about ``centre``."""
+        if edge not in self._surfaces:
+            self._surfaces[edge] = Surface(self.points, edge)
+        return self._surfaces[edge]
+
+    def described(self, edge: float, encoder: LocalEncoder) -> tuple[np.ndarray, Tensor]:
+        """Keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
+        if edge not in self._described:
+            surface = self.surface(edge)
+            index = surface.keypoints(KEYPOINTS)
+            patches = surface.patches(index, PATCH_RADIUS, NEIGHBOURS)
+            with torch.inference_mode():
+                found = encoder(describe_patches(**{k: torch.from_numpy(v) for k, v in patches.items()}))
+            self._described[edge] = surface.points[index], found
+        return self._described[edge]
+
+    def fine(self, count: int, edge: float) -> np.ndarray:
+        """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
+        points = self.points if len(self.points) <= 4 * count else voxel_downsample(self.points, edge / 2)
+        return sample(points, count, np.random.default_rng(self.seed))
+
+    def for_gicp(self, count: int, edge: float) -> polish.GicpCloud:
+        """``fine`` as small_gicp takes it."""
+        if (count, edge) not in self._gicp:
+            self._gicp[count, edge] = polish.GicpCloud(self.fine(count, edge), edge)
+        return self._gicp[count, edge]
+
+
+@dataclass
+class Candidate:
+    """A pose with what speaks for it. start: where it came from; errors: mean |r| of the IC solver that led to it."""
+
+    T: np.ndarray
+    start: str
+    errors: list[float]
+    evidence: verdict.Evidence
+
+    @property
+    def confidence(self) -> float:
+        return verdict.confidence(self.evidence)
+
+
+@dataclass
+class Start:
+    """A pose to refine. errors: mean |F(g Q) - F(P)| of each iteration where the IC solver led to it, else empty."""
+
+    T: np.ndarray
+    name: str
+    errors: list[float]
+
+
+class Pair:
+    """Two clouds at one voxel edge. encoder: F; local: of the patch features; motion: what is allowed."""
+
+    def __init__(
+        self,
+        source: Prepared,
+        target: Prepared,
+        encoder: Encoder,
+        local: LocalEncoder,
+        motion: Motion,
+        *,
+        voxel_size: float | None,
+        normalize: bool,
+        points: int,
+        iterations: int,
+        robust: bool,
+        seed: int,
+    ) -> None:
+        self.source, self.target, self.encoder, self.local, self.motion = source, target, encoder, local, motion
+        self.iterations, self.robust, self.seed = iterations, robust, seed
+        self.edge = voxel_size or pair_edge(source, target)
+        self.s, self.t = source.surface(self.edge), target.surface(self.edge)
+        if min(len(self.s.points), len(self.t.points)) < MIN_POINTS:
+            small = source if len(self.s.points) < MIN_POINTS else target
+            raise RegistrationError(
+                f"{small.name}: fewer than {MIN_POINTS} voxels of {self.edge:.3g} are occupied; give a smaller --voxel-size"
+            )
+        # The encoder was trained on clouds about their mean, of half extent 0.5.
+        self.length = 2 * float(np.abs(self.t.points - self.t.points.mean(0)).max()) if normalize else 1.0
+        self.origins = (self.s.points.mean(0), self.t.points.mean(0)) if normalize else (-source.centre, -target.centre)
+        rng = np.random.default_rng(seed)
+        device = next(encoder.parameters()).device
+        self.Q, self.P = (
+            torch.from_numpy(((sample(x.points, points, rng) - c) / self.length).astype(np.float32))[None].to(device)
+            for x, c in zip((self.s, self.t), self.origins, strict=True)
+        )
+
+    # Between the local frames and the encoder's: x -> (x - origin) / length.
+
+    def normalised(self, T: np.ndarray) -> np.ndarray:
+        g = T.copy()
+        g[:3, 3] = (T[:3, :3] @ self.origins[0] + T[:3, 3] - self.origins[1]) / self.length
+        return g
+
+    def restored(self, g: np.ndarray) -> np.ndarray:
+        T = g.copy()
+        T[:3, 3] = self.length * g[:3, 3] + self.origins[1] - g[:3, :3] @ self.origins[0]
+        return T
+
+    # Where a pose may start.
+
+    def from_features(self) -> list[Start]:
+        """Matched local features and their spatial consensus: any rotation, part overlap."""
+        (p, a), (q, b) = self.source.described(self.edge, self.local), self.target.described(self.edge, self.local)
+        pairs = match(a, b).numpy()
+        x, y = (
+            torch.from_numpy((k[i] / self.edge).astype(np.float32)) for k, i in ((p, pairs[:, 0]), (q, pairs[:, 1]))
+        )
+        motion = Motion(self.motion.dof, self.motion.up, self.motion.lift / self.edge)
+        T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0].double().numpy()
+        T[:, :3, 3] *= self.edge
+        return [Start(pose, "features", []) for pose in T]
+
+    @torch.inference_mode()
+    def from_search(self) -> list[Start]:
+        """The global feature from rotations spread over all that are allowed: any rotation, full overlap."""
+        starts = self.motion.starts(STARTS)
+        if self.motion.dof == "planar":
+            up = torch.tensor(self.motion.up, dtype=torch.float64)
+            offset = float(up @ torch.from_numpy(self.origins[0] - self.origins[1]))
+            starts[:, :3, 3] = (self.motion.lift + offset) / self.length * up
+        found = search(self.encoder, self.Q, self.P, starts, self.robust, self.motion.basis())
+        poses = found.g.double().cpu().numpy()
+        return [Start(self.restored(g), "search", e.tolist()) for g, e in zip(poses, found.errors.T, strict=True)]
+
+    @torch.inference_mode()
+    def from_pose(self, T: np.ndarray, name: str) -> list[Start]:
+        """A pose as it is, and where the IC solver of the paper goes from there."""
+        g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
+        template = make_template(self.encoder, self.P)
+        found = solve(self.encoder, template, self.Q, g, self.iterations, self.robust, self.motion.basis())
+        solved = self.restored(found.g[0].double().cpu().numpy())
+        return [Start(T, name, found.errors[:1, 0].tolist()), Start(solved, name, found.errors[:, 0].tolist())]
+
+    # How a pose is refined and judged.
+
+    def coincidence(self, T: np.ndarray) -> float:
+        """How much of the source comes close to the target at T, from 0 to 1, on few points."""
+        some = sample(self.s.points, RANKING_POINTS, np.random.default_rng(self.seed))
+        reach = 2 * self.edge
+        d = self.t.tree.query(some @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)[0]
+        return float(np.maximum(0, 1 - d / reach).mean())
+
+    def refine(
+        self, T: np.ndarray, levels: tuple[tuple[float, float], ...], iterations: int
+    ) -> tuple[np.ndarray, float]:
+        """Patch by patch from coarse to fine: the pose, and the median patch error over the mean feature norm."""
+        g, error = torch.from_numpy(T.copy()), float("nan")
+        g[:3, 3] /= self.length
+        for radius, coarseness in levels:
+            s, t = (x.surface(self.edge * coarseness) for x in (self.source, self.target))
+            reach = radius * self.edge
+            centres = torch.from_numpy(self.patch_centres(s, t, g.numpy(), reach) / self.length).float()
+            with torch.inference_mode():
+                template = patch_template(self.encoder, centres, balls(t, reach, self.length), reach / self.length)
+                fit = refine(
+                    self.encoder, template, balls(s, reach, self.length), g, iterations, self.motion.basis()
+                )  # fmt: skip
+            g = fit.g
+            error = float(fit.error.nanmedian() / template.feature.norm(dim=1).mean().clamp_min(1e-12))
+        T = g.numpy().copy()
+        T[:3, 3] *= self.length
+        return T, error
+
+    def patch_centres(self, s: Surface, t: Surface, g: np.ndarray, reach: float) -> np.ndarray:
+        """Points of the target, spread evenly, that the source comes near to at g: (P, 3)."""
+        some = sample(t.points, 6 * PATCHES, np.random.default_rng(self.seed))
+        back = (some - g[:3, 3] * self.length) @ g[:3, :3]
+        common = some[np.isfinite(s.tree.query(back, distance_upper_bound=reach / 2)[0])]
+        return (common if len(common) >= 8 else some)[:PATCHES]
+
+    def candidate(self, start: Start) -> Candidate:
+        """A start, refined and judged."""
+        T, patches = self.refine(start.T, FINE if start.name == "features" else LEVELS, PATCH_ITERATIONS)
+        return Candidate(T, start.name, start.errors, verdict.gather(self.s, self.t, T, patches))
+
+    def polished(self, candidate: Candidate, scale: bool) -> Candidate:
+        """The candidate after the last geometric step, judged again."""
+        if scale or self.motion.dof != "rigid":
+            s, t = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
+            T = polish.constrained(s, t, candidate.T, self.edge, self.motion.basis().numpy(), scale)
+        else:
+            s, t = self.source.for_gicp(POLISH_SOURCE, self.edge), self.target.for_gicp(POLISH_TARGET, self.edge)
+            T = polish.gicp(s, t, candidate.T, self.edge)
+        _, patches = self.refine(T, FINE, 0)
+        return Candidate(T, candidate.start, candidate.errors, verdict.gather(self.s, self.t, T, patches))
+
+    @torch.inference_mode()
+    def feature_error(self, T: np.ndarray) -> float:
+        """Mean |F(T Q) - F(P)| of the global feature at a pose."""
+        g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
+        return float(solve(self.encoder, make_template(self.encoder, self.P), self.Q, g, 0).error)
+
+
+def pair_edge(source: Prepared, target: Prepared) -> float:
+    """The voxel edge for both: the finer one's, but not below either's spacing, nor beyond what the larger one bears."""
+    fine, coarse = sorted((source.edge, target.edge))
+    return max(fine, coarse / LARGEST_RATIO, source.spacing, target.spacing)
+
+
+def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
+    """Look-ups for ``feature_metric.patches``: centres in units of ``length``, balls of ``radius`` (own unit)."""
+
+    def look(centres: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        c = centres.double().numpy() * length
+        index = surface.tree.query(c, BALL_POINTS, distance_upper_bound=radius)[1]
+        valid = index < len(surface.points)
+        offsets = (surface.points[np.where(valid, index, 0)] - c[:, None]) / radius
+        mask = torch.from_numpy(valid.astype(np.float32))
+        return torch.from_numpy(offsets.astype(np.float32)) * mask[..., None], mask, mask.sum(1)
+
+    return look
