@@ -142,7 +142,7 @@ class Pair:
         if min(len(self.s.points), len(self.t.points)) < MIN_POINTS:
             small = source if len(self.s.points) < MIN_POINTS else target
             raise RegistrationError(
-                f"{small.name}: fewer than {MIN_POINTS} voxels of {self.edge:.3g} are occupied; give a smaller --voxel-size"
+                f"{small.name}: fewer than {MIN_POINTS} voxels of {self.edge:.3g} hold points; lower --voxel-size"
             )
         # The encoder was trained on clouds about their mean, of half extent 0.5.
         self.length = 2 * float(np.abs(self.t.points - self.t.points.mean(0)).max()) if normalize else 1.0
@@ -246,8 +246,8 @@ class Pair:
     def polished(self, candidate: Candidate, scale: bool) -> Candidate:
         """The candidate after the last geometric step, judged again."""
         if scale or self.motion.dof != "rigid":
-            s, t = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
-            T = polish.constrained(s, t, candidate.T, self.edge, self.motion.basis().numpy(), scale)
+            x, y = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
+            T = polish.constrained(x, y, candidate.T, self.edge, self.motion.basis().numpy(), scale)
         else:
             s, t = self.source.for_gicp(POLISH_SOURCE, self.edge), self.target.for_gicp(POLISH_TARGET, self.edge)
             T = polish.gicp(s, t, candidate.T, self.edge)
@@ -262,7 +262,7 @@ class Pair:
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:
-    """The voxel edge for both: the finer one's, but not below either's spacing, nor beyond what the larger one bears."""
+    """The voxel edge for both: the finer one's, but not below either's spacing, nor too fine for the larger one."""
     fine, coarse = sorted((source.edge, target.edge))
     return max(fine, coarse / LARGEST_RATIO, source.spacing, target.spacing)
 

@@ -101,7 +101,7 @@ class Surface:
     def patches(self, index: np.ndarray, radius: float, neighbours: int) -> dict[str, np.ndarray]:
         """The neighbourhoods of points ``index`` (K,): what ``feature_metric.local.describe_patches`` takes, float32.
 
-        radius: in voxel edges. Offsets are in radii, nearest first; rows shorter than ``neighbours`` are not valid there.
+        radius: in voxel edges. Offsets are in radii, nearest first; what a row lacks of ``neighbours`` is not valid.
         """
         centres = self.points[index]
         found = self.tree.query(centres, min(neighbours, len(self.points)), distance_upper_bound=radius * self.edge)[1]

@@ -82,11 +82,11 @@ class Registration:
         came from local features.
     start: which start the pose came from ("identity", "centroid", "search", "features", "given").
     angle: rotation angle of T, degrees. shift: how far T moves the source's centre, own unit.
-    information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's mean;
-        rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.
+    information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's
+        mean; rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.
     undetermined: the directions that the scans hardly determine, in words.
     alternatives: other poses that fit about as well, best first: T_target_source, confidence, feature_error.
-    evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage and in total.
+    evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
     """
 
     T_target_source: np.ndarray
@@ -204,7 +204,7 @@ def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
 
 
 def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candidate]:
-    """Candidates, best first, from the starts that the options name; "auto" goes on while the verdict is not aligned."""
+    """Candidates, best first, from the starts that the options name; "auto" goes on while none is aligned."""
     candidates: list[Candidate] = []
     for name, starts in start_makers(pair, options):
         with stage(seconds, name):

@@ -45,7 +45,7 @@ def gather(source: Surface, target: Surface, T: np.ndarray, patches: float) -> E
     moved = source.points @ T[:3, :3].T + T[:3, 3]
     back = (target.points - T[:3, 3]) @ T[:3, :3]
     forth_d, forth_i = target.tree.query(moved, distance_upper_bound=AROUND * edge)
-    back_d, back_i = source.tree.query(back, distance_upper_bound=AROUND * edge)
+    back_d = source.tree.query(back, distance_upper_bound=AROUND * edge)[0]
     touching = np.concatenate([forth_d, back_d])
     touching = touching[touching < TOUCHING * edge]
     overlap = max(np.mean(forth_d < TOUCHING * edge), np.mean(back_d < TOUCHING * edge))

@@ -1,6 +1,8 @@
-"""The decoder of the paper: four fully connected layers with LeakyReLU, a feature back to a cloud. For training alone."""
+"""The decoder of the paper: four fully connected layers with LeakyReLU, a feature back to a cloud. For training."""
 
 from __future__ import annotations
+
+import itertools
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +17,7 @@ class Decoder(nn.Module):
         super().__init__()
         sizes = (feature_dim, *widths, 3 * points)
         layers: list[nn.Module] = []
-        for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+        for a, b in itertools.pairwise(sizes):
             layers += [nn.Linear(a, b), nn.LeakyReLU()]
         self.net = nn.Sequential(*layers[:-1])  # coordinates are signed: none after the last
 
@@ -24,7 +26,7 @@ class Decoder(nn.Module):
 
 
 def chamfer(a: Tensor, b: Tensor) -> Tensor:
-    """Symmetric Chamfer distance of point sets (B, N, 3) and (B, M, 3): mean squared distance to the nearest, both ways.
+    """Symmetric Chamfer distance of (B, N, 3) and (B, M, 3): mean squared distance to the nearest, both ways -> (B,).
 
     Who is nearest is found without a gradient, by matrix products; the gradient needs the N + M chosen pairs alone.
     """

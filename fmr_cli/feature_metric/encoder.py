@@ -6,8 +6,10 @@ batch normalisation: nothing to switch between training and use, and no cloud's 
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +27,12 @@ class Encoder(nn.Module):
         super().__init__()
         widths = (3, *hidden, feature_dim)
         self.hidden, self.feature_dim = tuple(hidden), feature_dim
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
+
+    @property
+    def linear(self) -> list[nn.Linear]:
+        """The MLP's layers, by their type."""
+        return [cast(nn.Linear, layer) for layer in self.layers]
 
     def pointwise(self, points: Tensor) -> Tensor:
         """f of every point: (..., 3) -> (..., K). The last layer is linear, so that every channel keeps a gradient."""
@@ -60,7 +67,7 @@ class Encoder(nn.Module):
         Channel k goes back through the MLP from its own row of the last layer, at its own point.
         """
         x = points.gather(1, index[..., None].expand(-1, -1, 3))  # [B x K x 3]
-        return chain(list(self.layers), self.active(x))
+        return chain(self.linear, self.active(x))
 
     def active(self, x: Tensor) -> list[Tensor]:
         """Which units of each hidden layer are on at points (..., 3): a list of (..., width)."""
@@ -72,12 +79,12 @@ class Encoder(nn.Module):
         return on
 
 
-def chain(layers: list[nn.Module], on: list[Tensor]) -> Tensor:
+def chain(layers: list[nn.Linear], on: list[Tensor]) -> Tensor:
     """Rows of the product W_n D_(n-1) W_(n-1) ... D_1 W_1, D the layers' 0/1 masks ``on`` (B, K, width): (B, K, 3).
 
     Row k of the last matrix goes with the masks of channel k's own point.
     """
-    row = layers[-1].weight  # [K x width]
+    row: Tensor = layers[-1].weight  # [K x width]
     for layer, mask in zip(reversed(layers[:-1]), reversed(on), strict=True):
         row = (row * mask) @ layer.weight
     return row

@@ -70,7 +70,10 @@ def describe_patches(offsets: Tensor, valid: Tensor, normal: Tensor, neighbour_n
     p = offsets.gather(1, index) @ frame.mT
     n = neighbour_normals.gather(1, index) @ frame.mT
     products = torch.stack(
-        [n[..., 0] ** 2, n[..., 1] ** 2, n[..., 2] ** 2, n[..., 0] * n[..., 1], n[..., 0] * n[..., 2], n[..., 1] * n[..., 2]],
+        [
+            n[..., 0] ** 2, n[..., 1] ** 2, n[..., 2] ** 2,
+            n[..., 0] * n[..., 1], n[..., 0] * n[..., 2], n[..., 1] * n[..., 2],
+        ],
         -1,
     )  # fmt: skip
     return torch.cat([p, products, p.norm(dim=-1, keepdim=True)], -1)

@@ -1,6 +1,6 @@
 """Which motions are allowed: all rigid ones, or those that keep the vertical, the heading or the plane.
 
-Each is a subgroup, so that a solver whose every step lies in ``basis`` never leaves it: nothing is projected afterwards.
+Each is a subgroup: a solver whose every step lies in ``basis`` never leaves it, and nothing is projected afterwards.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TURNS = 24  # starts about one axis: 15 deg apart
 
 @dataclass(frozen=True)
 class Motion:
-    """dof: "rigid"; "yaw": rotation about ``up`` and any translation; "translation"; "planar": yaw, and no shift along up.
+    """dof: "rigid"; "yaw": rotation about ``up``, any translation; "translation"; "planar": yaw, no shift along up.
 
     up: unit vector. lift: what "planar" keeps of the translation along up, in the frames in use.
     """

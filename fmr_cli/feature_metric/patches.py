@@ -55,7 +55,7 @@ class PatchFit:
 def patch_features(encoder: Encoder, offsets: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """F_c of every ball and the critical point of each channel: (P, n, 3), (P, n) -> (P, C), (P, C)."""
     x = offsets
-    for layer in encoder.layers[:LAYERS]:
+    for layer in encoder.linear[:LAYERS]:
         x = torch.relu_(layer(x))
     window = (1 - offsets.square().sum(-1)).clamp_min(0) * valid
     return (x * window[..., None]).max(1)
@@ -66,7 +66,7 @@ def patch_template(encoder: Encoder, centres: Tensor, neighbourhoods: Neighbourh
     offsets, valid, count = neighbourhoods(centres)
     feature, index = patch_features(encoder, offsets, valid)
     u = offsets.gather(1, index[..., None].expand(-1, -1, 3))  # [P x C x 3]
-    layers, on, x = list(encoder.layers[:LAYERS]), [], u
+    layers, on, x = encoder.linear[:LAYERS], [], u
     for layer in layers[:-1]:
         x = layer(x)
         on.append(x > 0)

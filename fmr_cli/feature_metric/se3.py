@@ -1,4 +1,4 @@
-"""SE(3): twists xi = (omega, v), rotation first, and their 4x4 matrices. Batched over leading dimensions, differentiable.
+"""SE(3): twists xi = (omega, v), rotation first, and their 4x4 matrices. Batched over leading dims, differentiable.
 
 Every coefficient is a power series near zero angle, so values and gradients stay exact where sin(a)/a would be 0/0.
 """
@@ -73,7 +73,7 @@ def _half_angle_axis(q: Tensor) -> Tensor:
 
 
 def quaternion(R: Tensor) -> Tensor:
-    """(..., 3, 3) rotation -> (..., 4) unit quaternion (w, x, y, z) with w >= 0 (Shepperd: the largest of four forms)."""
+    """(..., 3, 3) rotation -> (..., 4) unit quaternion (w, x, y, z), w >= 0 (Shepperd: the largest of four forms)."""
     m = R
     d = torch.stack(
         [

@@ -24,7 +24,7 @@ APART = math.radians(10.0)  # poses nearer than this are one
 
 @dataclass
 class Found:
-    """Distinct poses g (n, 4, 4), best first, with their mean |r| (n,), and the errors of every iteration (i + 1, n)."""
+    """Distinct poses g (n, 4, 4), best first; their mean |r| (n,), and that of every iteration (i + 1, n)."""
 
     g: Tensor
     error: Tensor

@@ -3,9 +3,9 @@
     once:            J = dF(exp(-xi) P)/dxi at xi = 0                                (on the target)
     every iteration: r = F(g Q) - F(P);  (JᵀWJ) dtheta = JᵀW r;  g <- exp(dtheta) g
 
-since F(exp(dtheta) g Q) = F(P) holds to first order where F(g Q) = F(exp(-dtheta) P) = F(P) + J dtheta. W is the identity
-in the paper; by default it is Geman-McClure's weight of each channel. A max-pooled channel is set by one point, so that
-channels whose point lies outside the overlap are outliers, and the weight switches them off.
+since F(exp(dtheta) g Q) = F(P) holds to first order where F(g Q) = F(exp(-dtheta) P) = F(P) + J dtheta. W is the
+identity in the paper; by default it is Geman-McClure's weight of each channel. A max-pooled channel is set by one
+point, so that channels whose point lies outside the overlap are outliers, and the weight switches them off.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ APART = 3.0  # voxel edges: nearer places are not each other's negatives
 
 @dataclass
 class Views:
-    """Corresponding patches of one pair of scans: (n, PATCH_POINTS, CHANNELS) each, and their places (n, 3) in voxels."""
+    """Corresponding patches of two scans: (n, PATCH_POINTS, CHANNELS) each, and their places (n, 3) in voxels."""
 
     source: Tensor
     target: Tensor
@@ -48,7 +48,7 @@ def scan_pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     elif kind == "street":
         scene, place = scenes.street(rng), np.array([rng.uniform(-40, 40), rng.uniform(-2, 2), 1.8])
         first = scenes.street_scan(scene, rng, place)
-        second = scenes.street_scan(scene, rng, place + [rng.uniform(-20, 20), rng.uniform(-1, 1), 0])
+        second = scenes.street_scan(scene, rng, place + np.array([rng.uniform(-20, 20), rng.uniform(-1, 1), 0]))
     else:
         scene, towards = scenes.thing(rng), rng.normal(size=3)
         views = int(rng.integers(1, 8))
@@ -82,15 +82,15 @@ def make_views(rng: np.random.Generator, count: int) -> Views | None:
     if len(index) < 16:
         return None
     index = rng.permutation(index)[:count]
-    views = [
+    a, b = (
         describe_patches(**{k: torch.from_numpy(v) for k, v in s.patches(i, PATCH_RADIUS, NEIGHBOURS).items()})
         for s, i in ((source, index), (target, match[index]))
-    ]
-    return Views(*views, torch.from_numpy(where[index] / edge).float())
+    )
+    return Views(a, b, torch.from_numpy(where[index] / edge).float())
 
 
 def info_nce(a: Tensor, b: Tensor, place: Tensor) -> Tensor:
-    """InfoNCE of descriptors a, b (n, d) whose rows correspond; rows within APART of each other's place do not repel."""
+    """InfoNCE of descriptors a, b (n, d) whose rows correspond; rows of places within APART do not repel."""
     logits = a @ b.T / TEMPERATURE
     close = (torch.cdist(place, place) < APART) & ~torch.eye(len(a), dtype=torch.bool)
     logits = logits.masked_fill(close, -1e4)
@@ -99,7 +99,7 @@ def info_nce(a: Tensor, b: Tensor, place: Tensor) -> Tensor:
 
 
 def pair_views(seed: tuple[int, int]) -> Views:
-    """The views of pair ``seed`` = (run, number): the first fresh pair of its own random stream that shares a surface."""
+    """The views of pair ``seed`` = (run, number): the first pair of its own random stream that shares a surface."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
     while True:
@@ -115,7 +115,7 @@ def make_material(pairs: int, seed: int, workers: int) -> list[Views]:
 
 
 def train(material: list[Views], steps: int, seed: int, batch: int = 4) -> LocalEncoder:
-    """Train for ``steps`` steps of ``batch`` pairs each (Adam 1e-3 with a cosine, bfloat16 products); logs to stderr."""
+    """Train for ``steps`` steps of ``batch`` pairs each (Adam 1e-3, cosine, bfloat16 products); logs to stderr."""
     rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
     start = time.time()
@@ -148,7 +148,7 @@ def held_out_rank1(model: LocalEncoder, views: Views) -> float:
 
 
 def main(out: str, pairs: int = 320, steps: int = 1600, seed: int = 0) -> None:
-    """``python -m fmr_cli.training.local models/local.safetensors``: the bundled local encoder, from nothing but code."""
+    """``python -m fmr_cli.training.local models/local.safetensors``: the bundled local encoder, from code alone."""
     from safetensors.torch import save_file
 
     material = make_material(pairs, seed, workers=multiprocessing.cpu_count())

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 CUBE, BALL, CYLINDER = 0, 1, 2
@@ -22,7 +23,7 @@ class Scene:
     kinds: list[int] = field(default_factory=list)
     maps: list[np.ndarray] = field(default_factory=list)
 
-    def add(self, kind: int, centre: np.ndarray, half: np.ndarray, rotation: Rotation | None = None) -> None:
+    def add(self, kind: int, centre: ArrayLike, half: ArrayLike, rotation: Rotation | None = None) -> None:
         """A solid of half extents ``half`` (3,) at ``centre`` (3,), turned by ``rotation``."""
         A = np.eye(4)
         A[:3, :3] = (np.eye(3) if rotation is None else rotation.as_matrix()) * np.asarray(half, float)
@@ -31,7 +32,7 @@ class Scene:
         self.maps.append(A)
 
     def cast(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distance along each unit direction (N, 3) to the first surface seen from origin (3,), FAR where there is none."""
+        """Distance along each unit direction (N, 3) to the first surface seen from origin (3,), or FAR."""
         nearest = np.full(len(directions), FAR)
         for kind, A in zip(self.kinds, self.maps, strict=True):
             # Only rays that meet the solid's bounding sphere are worth the exact test.
@@ -148,7 +149,7 @@ def street(rng: np.random.Generator, length: float = 160.0) -> Scene:
         scene.add(CYLINDER, [x, y, tall], [0.05 + 0.2 * rng.random() ** 2, 0.05 + 0.2 * rng.random() ** 2, tall])
         if rng.random() < 0.6:
             for _ in range(rng.integers(1, 5)):
-                scene.add(BALL, [x, y, 2 * tall] + rng.normal(0, 0.8, 3), rng.uniform(0.4, 1.6, 3), _yaw(rng, 0.3))
+                scene.add(BALL, rng.normal([x, y, 2 * tall], 0.8), rng.uniform(0.4, 1.6, 3), _yaw(rng, 0.3))
     return scene
 
 
@@ -172,7 +173,7 @@ def camera_rays(rotation: Rotation, width: int = 128, height: int = 96, fov: flo
 
 
 def lidar_rays(rotation: Rotation, beams: int = 64, columns: int = 900) -> np.ndarray:
-    """Unit directions (beams * columns, 3) of a spinning scanner, its beams from 3 deg above the horizon to 25 below."""
+    """Unit directions (beams * columns, 3) of a spinning scanner, from 3 deg above the horizon to 25 below."""
     azimuth, elevation = np.meshgrid(np.linspace(0, 2 * np.pi, columns, False), np.radians(np.linspace(3, -25, beams)))
     flat = np.cos(elevation)
     rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
@@ -182,7 +183,7 @@ def lidar_rays(rotation: Rotation, beams: int = 64, columns: int = 900) -> np.nd
 def scan(
     scene: Scene, origin: np.ndarray, rays: np.ndarray, rng: np.random.Generator, noise: float, reach: float
 ) -> np.ndarray:
-    """World points (n, 3) that the rays from origin hit within reach, with Gaussian range noise; 2 % of them are lost."""
+    """World points (n, 3) that the rays from origin hit within reach; Gaussian range noise, 2 % of them lost."""
     distance = scene.cast(origin, rays)
     seen = (distance < reach) & (rng.random(len(rays)) > 0.02)
     distance = distance[seen] * (1 + rng.normal(0, noise, seen.sum()))
