@@ -1,0 +1,140 @@
+"""`fmr train`: from scans to weights that `fmr align` takes, interrupted in every way, refused on one line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+RECIPE = """
+start = "scratch"
+feature_dim = 32
+hidden = [16, 16]
+cloud_points = 256
+points = 64
+chamfer_batch = 4
+pose_batch = 4
+unroll = 2
+epoch_steps = 5
+held_out_pairs = 2
+crops = 24
+"""
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    (tmp_path / "tiny.toml").write_text(RECIPE)
+    return tmp_path / "tiny.toml"
+
+
+def test_train_on_scans_with_all_defaults_from_the_bundled_weights(tmp_path, fmr_here, samples):
+    done = fmr_here("train", "--unsupervised", samples, "--minutes", "0.01", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    run = tmp_path / "runs/train"
+    assert {f.name for f in run.iterdir()} >= {
+        "model.safetensors", "README.md", "recipe.toml", "metrics.csv", "state.safetensors",
+    }  # fmt: skip
+    assert "48 crops of 2 scans" in (run / "README.md").read_text()
+    assert "holds the start" in done.stderr or "which is kept" in done.stderr
+
+
+def test_the_recipe_of_a_run_gives_the_same_weights_again(tmp_path, fmr_here, samples, recipe):
+    first = fmr_here(
+        "train", samples, "--recipe", recipe, "--semi-supervised", "--epochs", "2", "--overlap", "0.7", "-o", "a",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert first.returncode == 0, first.stderr
+    assert "overlap = 0.7" in (tmp_path / "a/recipe.toml").read_text()
+    again = fmr_here("train", samples, "--recipe", "a/recipe.toml", "-o", "b", "-q", cwd=tmp_path)
+    assert (again.returncode, again.stderr) == (0, "")
+    a, b = (load_file(tmp_path / run / "state.safetensors") for run in "ab")
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_kill_and_resume_end_in_the_same_weights(tmp_path, fmr_here, samples, recipe):
+    arguments = ["train", str(samples), "--recipe", str(recipe), "--unsupervised", "--epochs", "4"]
+    command = [sys.executable, "-m", "fmr_cli.cli", *arguments, "-o", "killed"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if line.startswith("epoch 2"):
+            break
+    time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    resumed = fmr_here("train", samples, "-o", "killed", "--resume", cwd=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
+    assert fmr_here(*arguments, "-o", "whole", cwd=tmp_path).returncode == 0
+    for name in ("state.safetensors", "model.safetensors"):
+        killed, whole = load_file(tmp_path / "killed" / name), load_file(tmp_path / "whole" / name)
+        assert all(torch.equal(killed[key], whole[key]) for key in whole)
+
+
+def test_ctrl_c_keeps_the_best_so_far(tmp_path, samples, recipe):
+    command = [
+        sys.executable,
+        "-m",
+        "fmr_cli.cli",
+        "train",
+        str(samples),
+        "--recipe",
+        str(recipe),
+        "--epochs",
+        "100000",
+    ]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if line.startswith("epoch 1"):
+            break
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "stopped at step" in said
+    assert (tmp_path / "runs/train/README.md").is_file()
+
+
+def test_two_processes_average_their_gradients(tmp_path, samples, recipe):
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "fmr_cli.cli",
+        "train", str(samples), "--unsupervised", "--recipe", str(recipe), "--epochs", "1", "-o", "two",
+    ]  # fmt: skip
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "2 processes" in (tmp_path / "two/README.md").read_text()
+    assert done.stderr.count("epoch 1, step 5") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("{samples}",), "say how to learn"),
+        (("--unsupervised",), "nothing to train on"),
+        (("--unsupervised", "empty"), "empty: no scan in there"),
+        (("--unsupervised", "{samples}", "--from", "none.safetensors"), "none.safetensors: no such model file"),
+        (("--unsupervised", "{samples}", "--from", "bad.safetensors"), "bad.safetensors: not a safetensors file"),
+        (("--recipe", "none.toml"), "none.toml: no such recipe"),
+        (("--unsupervised", "{samples}", "--resume"), "--resume goes on with the settings saved"),
+        (("{samples}", "--resume"), "there is no run to resume"),
+        (("--unsupervised", "{samples}", "-o", "full"), "holds a run already"),
+        (("--unsupervised", "{samples}", "-o", "bad.safetensors/run"), "cannot make this folder"),
+        (("--unsupervised", "{samples}", "--pairs", "none.csv"), "has no use for poses"),
+        (("--pairs", "none.csv", "{samples}"), "none.csv: no such file"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, fmr_here, samples, arguments, said):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/state.safetensors").write_text("a run")
+    (tmp_path / "bad.safetensors").write_text("no weights")
+    done = fmr_here("train", *(a.format(samples=samples) for a in arguments), cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert (tmp_path / "full/state.safetensors").read_text() == "a run"

@@ -1,0 +1,104 @@
+"""The loop: a resumed run ends where an uninterrupted one does; the best is kept; a NaN stops it with nothing lost."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from fmr_cli.errors import FmrError, ModelError
+from fmr_cli.feature_metric.encoder import load_encoder, load_weights
+from fmr_cli.training.loop import Trainer, TrainingError, read_start
+
+
+def finish(trainer):
+    return finish_reports(trainer.run())
+
+
+def finish_reports(reports):
+    return [report.row for report in reports if report.row]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, tiny, data):
+    """An uninterrupted run: (folder, rows, trainer)."""
+    folder = tmp_path_factory.mktemp("whole")
+    trainer = Trainer(tiny, data, folder, None)
+    return folder, finish(trainer), trainer
+
+
+@pytest.mark.parametrize("steps_before_the_end", [3, 4, 5])
+def test_a_run_that_ends_anywhere_goes_on_to_the_same_numbers(tmp_path, tiny, data, whole, steps_before_the_end):
+    folder, rows, _ = whole
+    for report in Trainer(tiny, data, tmp_path, None).run():
+        if report.step == steps_before_the_end:
+            break
+    finish(Trainer(tiny, data, tmp_path, None, resume=True))
+    for name in ("state.safetensors", "model.safetensors"):
+        ours, theirs = load_file(tmp_path / name), load_file(folder / name)
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+    epochs = [row["success"] for row in csv.DictReader((tmp_path / "metrics.csv").open())]
+    assert epochs == [str(row["success"]) for row in rows]
+
+
+def test_the_best_epoch_is_kept(whole):
+    folder, rows, trainer = whole
+    assert len(rows) == 4
+    assert trainer.progress.best == max(range(4), key=trainer.quality)
+    assert load_encoder(folder / "model.safetensors").feature_dim == 32
+
+
+def test_weights_go_on_with_their_decoder(whole):
+    folder, _, _ = whole
+    encoder, decoder = load_weights(folder / "model.safetensors")
+    assert encoder.hidden == (16, 16)
+    assert decoder
+
+
+def test_a_new_decoder_is_trained_before_it_may_change_a_trained_encoder(tmp_path, tiny, data, whole):
+    start = (load_encoder(whole[0] / "model.safetensors"), {})
+    before = {name: value.clone() for name, value in start[0].state_dict().items()}
+    recipe = tiny.changed(pose_weight=0.0, decoder_warmup=4, steps=4)
+    trainer = Trainer(recipe, data, tmp_path, start)
+    first = {name: value.clone() for name, value in trainer.decoder.state_dict().items()}
+    finish(trainer)
+    assert all(torch.equal(value, before[name]) for name, value in trainer.encoder.state_dict().items())
+    assert any(not torch.equal(value, first[name]) for name, value in trainer.decoder.state_dict().items())
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_what_there_was(tmp_path, tiny, data):
+    trainer = Trainer(tiny, data, tmp_path, None)
+    reports = trainer.run()
+    while next(reports).step < 3:
+        pass
+    with torch.no_grad():
+        trainer.encoder.layers[0].weight.fill_(float("nan"))
+    with pytest.raises(TrainingError, match=r"not finite at step 3; .*model.safetensors holds the best weights"):
+        finish_reports(reports)
+    kept = load_encoder(tmp_path / "model.safetensors")
+    assert all(bool(torch.isfinite(p).all()) for p in kept.parameters())
+
+
+def test_minutes_bound_the_run_and_the_plan_is_saved(tmp_path, tiny, data):
+    trainer = Trainer(tiny.changed(steps=10**9, epoch_steps=1000), data, tmp_path, None, minutes=0.02)
+    finish(trainer)
+    assert trainer.progress.step < 10_000
+    assert trainer.progress.seconds < 30
+
+
+@pytest.mark.parametrize("spoil", ["text", "other architecture"])
+def test_a_state_that_does_not_fit_is_one_line(tmp_path, tiny, data, whole, spoil):
+    state = (whole[0] / "state.safetensors").read_bytes()
+    (tmp_path / "state.safetensors").write_bytes(b"no state" if spoil == "text" else state)
+    recipe = tiny if spoil == "text" else tiny.changed(feature_dim=48)
+    with pytest.raises(ModelError, match=r"state.safetensors: no state to resume") as error:
+        Trainer(recipe, data, tmp_path, None, resume=True)
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_weights_to_start_from_are_one_line(tmp_path):
+    with pytest.raises(FmrError, match="no such model file"):
+        read_start(str(tmp_path / "none.safetensors"))

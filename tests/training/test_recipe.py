@@ -1,0 +1,41 @@
+"""Recipes: what is written can be read back, what cannot be run is said on one line."""
+
+from __future__ import annotations
+
+import pytest
+
+from fmr_cli.training.recipe import Recipe, RecipeError, read_recipe
+
+
+def test_a_recipe_survives_its_file(tmp_path):
+    recipe = Recipe().changed(hidden=(32, 64), learning_rate=0.5, overlap=0.7, start='my "own" weights.safetensors')
+    (tmp_path / "r.toml").write_text(recipe.toml())
+    assert read_recipe(tmp_path / "r.toml") == recipe
+
+
+def test_missing_keys_keep_their_defaults(tmp_path):
+    (tmp_path / "r.toml").write_text("steps = 7\nlearning_rate = 1\n[augment]\nnoise = 0\n")
+    assert read_recipe(tmp_path / "r.toml") == Recipe(steps=7, learning_rate=1.0).changed(noise=0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("stepps = 7", "unknown key 'stepps'"),
+        ("[augment]\nspin = 1", "unknown key 'spin'"),
+        ("steps = 'many'", "steps must be a whole number"),
+        ("robust = 1", "robust must be true or false"),
+        ("hidden = [64, -1]", "hidden must be a list of whole numbers"),
+        ("steps = 0", "steps = 0"),
+        ("held_out = 1.0", "held_out between 0 and 1"),
+        ("chamfer_weight = 0", "no loss"),
+        ("steps =", "not valid TOML"),
+        ("augment = 3", "must be a table"),
+    ],
+)
+def test_what_cannot_be_run_is_said_on_one_line(tmp_path, text, said):
+    (tmp_path / "r.toml").write_text(text)
+    with pytest.raises(RecipeError, match=said) as error:
+        read_recipe(tmp_path / "r.toml")
+    assert str(error.value).startswith(str(tmp_path / "r.toml"))
+    assert "\n" not in str(error.value)
