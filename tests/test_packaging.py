@@ -30,7 +30,8 @@ def names(tmp_path_factory) -> set[str]:
 
 def test_the_wheel_holds_every_weight_card_and_recipe(names):
     bundled = {path.name for path in (ROOT / "models").iterdir() if path.suffix in (".safetensors", ".md", ".toml")}
-    assert {"base.safetensors", "base.md", "base.toml"} <= bundled
+    assert {"base.safetensors", "base.toml", "local.safetensors"} <= bundled
+    assert any(name.endswith(".md") for name in bundled)
     assert {f"fmr_cli/models/{name}" for name in bundled} <= names
 
 

@@ -38,7 +38,7 @@ def test_json_is_the_metrics_and_can_be_piped(run, samples):
     assert said["status"] == "aligned"
     assert said["T_target_source"] == read_transform(folder / "T.txt").tolist()
     assert said["source"] == {"file": str(samples / "scan_a.ply"), "points": 8000, "dropped": 0}
-    expected = {"confidence", "overlap", "inlier_rmse", "feature_errors", "angle_deg", "shift", "iterations", "points"}
+    expected = {"confidence", "overlap", "inlier_rmse", "feature_errors", "angle", "shift", "iterations", "points"}
     assert expected | {"seconds", "versions", "options", "start"} <= set(said)
     assert {"total"} < set(said["seconds"])
     assert said["options"]["seed"] == 0
