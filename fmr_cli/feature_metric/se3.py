@@ -26,7 +26,7 @@ def _coefficients(angle2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     a = safe.sqrt()
     t = angle2
     sinc = torch.where(small, 1 - t / 6 + t**2 / 120 - t**3 / 5040, a.sin() / a)
-    versine = torch.where(small, 0.5 - t / 24 + t**2 / 720 - t**3 / 40320, (1 - a.cos()) / safe)
+    versine = torch.where(small, 0.5 - t / 24 + t**2 / 720 - t**3 / 40320, 2 * ((a / 2).sin() / a) ** 2)
     cubic = torch.where(small, 1 / 6 - t / 120 + t**2 / 5040 - t**3 / 362880, (a - a.sin()) / (safe * a))
     return sinc, versine, cubic
 

@@ -15,7 +15,7 @@ from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.motion import rotation_between
 from fmr_cli.feature_metric.solver import make_template, solve
 
-# 64 rotations leave no rotation further than about 50 deg from a start; the solver's basin, measured, reaches 60.
+# 64 rotations leave none further than 60.4 deg from a start (30 on average); the solver's basin, measured, reaches 60.
 STARTS = 64
 COARSE_POINTS, COARSE_ITERATIONS = 256, 6
 KEPT, FINE_ITERATIONS = 6, 15
