@@ -7,6 +7,7 @@ order and translates to the files' coordinates.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from fmr_cli.feature_metric.motion import Motion
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.feature_metric.search import STARTS, search
 from fmr_cli.feature_metric.solver import make_template, solve
-from fmr_cli.preprocess import Surface, sample, voxel_downsample, working_scale
+from fmr_cli.preprocess import Surface, distinct, sample, voxel_downsample, working_scale
 
 MIN_POINTS = 10
 KEYPOINTS = 500
@@ -35,6 +36,8 @@ FINE = LEVELS[
 ]  # enough from matched features, which are within CONSENSUS_TOLERANCE; its residual goes to the verdict
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
 POLISH_TARGET, POLISH_SOURCE = 24_000, 8_000
+POLISH_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
+SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxels
 LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
 
 
@@ -46,7 +49,9 @@ class Prepared:
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
-        points = np.unique(cloud.points[np.isfinite(cloud.points).all(1)], axis=0)
+        points = cloud.points[np.isfinite(cloud.points).all(1)]
+        self.centre = points.mean(0) if len(points) else np.zeros(3)
+        points = distinct(points - self.centre)
         if len(points) == 1 and len(cloud) > 1:
             raise RegistrationError(f"{cloud.name}: all {len(cloud)} points are in one place; give a scan of a surface")
         if len(points) < MIN_POINTS:
@@ -54,8 +59,7 @@ class Prepared:
                 f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
             )
         self.name, self.read, self.seed = cloud.name, len(cloud), seed
-        self.centre = points.mean(0)
-        self.points = points - self.centre
+        self.points = points
         self.edge, self.spacing = working_scale(self.points, np.random.default_rng(seed))
         self._surfaces: dict[float, Surface] = {}
         self._described: dict[float, tuple[np.ndarray, Tensor]] = {}
@@ -168,13 +172,22 @@ class Pair:
 
     # Where a pose may start.
 
-    def from_features(self) -> list[Start]:
-        """Matched local features and their spatial consensus: any rotation, part overlap."""
+    @cached_property
+    def matches(self) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints of source and target whose descriptors match: (C, 3) each, row by row."""
         (p, a), (q, b) = self.source.described(self.edge, self.local), self.target.described(self.edge, self.local)
         pairs = match(a, b).numpy()
-        x, y = (
-            torch.from_numpy((k[i] / self.edge).astype(np.float32)) for k, i in ((p, pairs[:, 0]), (q, pairs[:, 1]))
-        )
+        return p[pairs[:, 0]], q[pairs[:, 1]]
+
+    def votes(self, T: np.ndarray) -> int:
+        """How many matches agree with a pose, whatever start it came from."""
+        x, y = self.matches
+        distance = np.linalg.norm(x @ T[:3, :3].T + T[:3, 3] - y, axis=1)
+        return int((distance < CONSENSUS_TOLERANCE * self.edge).sum())
+
+    def from_features(self) -> list[Start]:
+        """Matched local features and their spatial consensus: any rotation, part overlap."""
+        x, y = (torch.from_numpy((k / self.edge).astype(np.float32)) for k in self.matches)
         motion = Motion(self.motion.dof, self.motion.up, self.motion.lift / self.edge)
         T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0].double().numpy()
         T[:, :3, 3] *= self.edge
@@ -238,21 +251,26 @@ class Pair:
         common = some[np.isfinite(s.tree.query(back, distance_upper_bound=reach / 2)[0])]
         return (common if len(common) >= 8 else some)[:PATCHES]
 
-    def candidate(self, start: Start) -> Candidate:
-        """A start, refined and judged."""
-        T, patches = self.refine(start.T, FINE if start.name == "features" else LEVELS, PATCH_ITERATIONS)
-        return Candidate(T, start.name, start.errors, verdict.gather(self.s, self.t, T, patches))
+    def judged(self, T: np.ndarray, start: Start, patches: float) -> Candidate:
+        """A pose with the evidence gathered at it; patches: the median patch error there."""
+        return Candidate(T, start.name, start.errors, verdict.gather(self.s, self.t, T, patches, self.votes(T)))
 
-    def polished(self, candidate: Candidate, scale: bool) -> Candidate:
-        """The candidate after the last geometric step, judged again."""
+    def candidate(self, start: Start, polished: bool, scale: bool) -> Candidate:
+        """A start, refined patch by patch, polished where asked, and judged."""
+        T, patches = self.refine(start.T, FINE if start.name == "features" else LEVELS, PATCH_ITERATIONS)
+        if polished:
+            T = self.polished(T, scale)
+            _, patches = self.refine(T, FINE, 0)
+        return self.judged(T, start, patches)
+
+    def polished(self, T: np.ndarray, scale: bool) -> np.ndarray:
+        """The pose after the last geometric step."""
         if scale or self.motion.dof != "rigid":
-            x, y = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
-            T = polish.constrained(x, y, candidate.T, self.edge, self.motion.basis().numpy(), scale)
-        else:
-            s, t = self.source.for_gicp(POLISH_SOURCE, self.edge), self.target.for_gicp(POLISH_TARGET, self.edge)
-            T = polish.gicp(s, t, candidate.T, self.edge)
-        _, patches = self.refine(T, FINE, 0)
-        return Candidate(T, candidate.start, candidate.errors, verdict.gather(self.s, self.t, T, patches))
+            s, t = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
+            return polish.constrained(s, t, T, self.edge, self.motion.basis().numpy(), scale)
+        return polish.gicp(
+            self.source.for_gicp(POLISH_SOURCE, self.edge), self.target.for_gicp(POLISH_TARGET, self.edge), T, self.edge
+        )
 
     @torch.inference_mode()
     def feature_error(self, T: np.ndarray) -> float:
@@ -264,7 +282,7 @@ class Pair:
 def pair_edge(source: Prepared, target: Prepared) -> float:
     """The voxel edge for both: the finer one's, but not below either's spacing, nor too fine for the larger one."""
     fine, coarse = sorted((source.edge, target.edge))
-    return max(fine, coarse / LARGEST_RATIO, source.spacing, target.spacing)
+    return max(fine, coarse / LARGEST_RATIO, SPACINGS * source.spacing, SPACINGS * target.spacing)
 
 
 def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:

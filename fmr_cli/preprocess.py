@@ -36,19 +36,26 @@ def cell_numbers(points: np.ndarray, edge: float) -> np.ndarray:
     return (x * (y.max() + 1) + y) * (z.max() + 1) + z
 
 
+def distinct(points: np.ndarray) -> np.ndarray:
+    """The points without exact repetitions: (N, 3) -> (M, 3), M <= N.
+
+    Sorted by their distance along one oblique line, which differs for all points that differ (but by a rare chance).
+    """
+    return points[np.unique(points @ [0.5377, 0.3183, 0.7809], return_index=True)[1]]
+
+
 def sample(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """At most ``count`` points without repetition, (N, 3) -> (min(N, count), 3)."""
     return points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]
 
 
 def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
-    """The voxel edge at which about ``WORKING_VOXELS`` are occupied, and the spacing of the points, own unit.
+    """The voxel edge at which about ``WORKING_VOXELS`` are occupied, and the spacing of distinct points, own unit.
 
     Both by count, so that a few points far away do not matter. The spacing is the median distance to the nearest other
     point, rescaled from a sample as on a surface.
     """
     some = sample(points, SAMPLE, rng)
-    some = np.unique(some, axis=0)
     nearest = cKDTree(some).query(sample(some, 2000, rng), 2)[0][:, 1]
     spacing = float(np.median(nearest)) * np.sqrt(len(some) / max(len(points), len(some)))
     low, high = spacing / 4, float(np.ptp(some, axis=0).max())

@@ -26,6 +26,7 @@ from fmr_cli.weights import bundled_local_encoder, encoder
 
 Init = Literal["auto", "search", "features", "centroid", "identity"]
 REFINED = 3  # starts that are refined, of each kind
+SURE, RIVAL = 0.95, 0.85  # once a pose is that sure, only starts that coincide nearly as much are looked at
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
 AS_GOOD = 0.5  # of the best one's odds: an alternative worth telling
@@ -176,9 +177,6 @@ def align(source: PointCloud | Prepared, target: PointCloud | Prepared, options:
         scaled = source if factor == 1.0 else source.scaled(factor)
         pair = make_pair(scaled, target, options)
         candidates = find(pair, options, seconds)
-        if options.refine or options.scale:
-            with stage(seconds, "polish"):
-                candidates[0] = pair.polished(candidates[0], options.scale)
         if best is None or candidates[0].confidence > best[2][0].confidence:
             best = pair, factor, candidates
     assert best is not None
@@ -209,17 +207,22 @@ def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candid
     for name, starts in start_makers(pair, options):
         with stage(seconds, name):
             ranked = sorted(
-                (s for s in starts() if within_bounds(s.T, pair, options)), key=lambda s: -pair.coincidence(s.T)
+                ((pair.coincidence(s.T), s) for s in starts() if within_bounds(s.T, pair, options)), key=lambda x: -x[0]
             )
         with stage(seconds, "refine"):
-            candidates += [pair.candidate(start) for start in ranked[:REFINED]]
-        candidates = [c for c in candidates if within_bounds(c.T, pair, options)]
+            for coincidence, start in ranked[:REFINED]:
+                sure = candidates and max(c.confidence for c in candidates) >= SURE
+                if sure and coincidence < RIVAL * ranked[0][0]:
+                    break
+                candidate = pair.candidate(start, options.refine, options.scale)
+                if within_bounds(candidate.T, pair, options):
+                    candidates.append(candidate)
         candidates.sort(key=lambda c: -c.confidence)
         if candidates and candidates[0].confidence >= verdict.ALIGNED:
             break
     if not candidates:  # every pose found lies beyond --max-angle or --max-shift
-        here = local_pose(np.eye(4), pair)
-        candidates = [Candidate(here, "identity", [], verdict.gather(pair.s, pair.t, here, float("nan")))]
+        here = Start(local_pose(np.eye(4), pair), "identity", [])
+        candidates = [pair.judged(here.T, here, float("nan"))]
     return distinct(candidates, pair.edge)
 
 

@@ -24,6 +24,7 @@ class Evidence:
     near: of the points within AROUND of the other scan, the share within NEAR: surfaces that coincide, not just cross.
     normals: mean |cosine| between the normals of touching points.
     patches: median patch residual at the pose over the patches' mean feature norm; 1 where none is co-occupied.
+    votes: how many matches of local features agree with the pose, whether or not it came from them.
     """
 
     overlap: float
@@ -31,15 +32,15 @@ class Evidence:
     near: float
     normals: float
     patches: float
+    votes: int
 
     def vector(self) -> np.ndarray:
         """What the logistic model sees."""
-        return np.array(
-            [1.0, np.log(max(self.overlap, 1e-3)), self.near, self.normals, np.log(max(self.patches, 1e-3))]
-        )
+        logs = np.log(np.maximum([self.overlap, self.patches], 1e-3))
+        return np.array([1.0, logs[0], self.near, self.normals, logs[1], np.log1p(self.votes)])
 
 
-def gather(source: Surface, target: Surface, T: np.ndarray, patches: float) -> Evidence:
+def gather(source: Surface, target: Surface, T: np.ndarray, patches: float, votes: int) -> Evidence:
     """Evidence at T (4x4, source to target, in the surfaces' frames); both surfaces on the same voxel edge."""
     edge = target.edge
     moved = source.points @ T[:3, :3].T + T[:3, 3]
@@ -59,10 +60,11 @@ def gather(source: Surface, target: Surface, T: np.ndarray, patches: float) -> E
         near=float(near / max(around, 1)),
         normals=float(np.abs(cosine).mean()) if len(here) else 0.0,
         patches=patches if np.isfinite(patches) else 1.0,
+        votes=votes,
     )
 
 
-WEIGHTS = np.array([-14.0, 2.0, 10.0, 10.0, -2.0])
+WEIGHTS = np.array([-14.0, 2.0, 10.0, 10.0, -2.0, 0.5])
 
 
 def confidence(evidence: Evidence) -> float:
