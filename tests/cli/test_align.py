@@ -109,6 +109,39 @@ def test_points_without_finite_coordinates_are_counted(fmr, samples, tmp_path):
     assert "80 points" in done.stderr
 
 
+def test_a_moved_las_comes_back_to_its_place_with_its_attributes_and_crs(fmr, shared_data, tmp_path):
+    original = read_cloud(shared_data / "las" / "autzen_trim.las")
+    centre, angle = original.points.mean(0), np.radians(2)
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    T[:3, 3] = centre - T[:3, :3] @ centre + [7, -4, 2]
+    write_cloud(tmp_path / "moved.las", original.transformed(T))
+    target = shared_data / "las" / "autzen_trim.las"
+    done = fmr("align", "moved.las", target, "-o", "T.txt", "--aligned", "back.las", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    back = read_cloud(tmp_path / "back.las")
+    assert np.linalg.norm(back.points - original.points, axis=1).max() < 0.02
+    assert back.crs == original.crs
+    assert back.attributes["residual"].max() < 0.05
+    for name in ("red", "green", "blue", "gps_time", "intensity"):
+        np.testing.assert_array_equal(back.attributes[name], original.attributes[name])
+
+
+def test_two_fragments_of_a_room_turned_at_random(fmr, shared_data, tmp_path, pose_error):
+    folder = shared_data / "redkitchen" / "fragments"
+    poses = [np.loadtxt(folder / f"cloud_bin_{i}.pose.txt") for i in (0, 1)]
+    turn = np.eye(4)
+    turn[:3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    turn[:3, :3] *= np.linalg.det(turn[:3, :3])
+    source = read_cloud(folder / "cloud_bin_1.ply", attributes=False)
+    write_cloud(tmp_path / "turned.ply", source.transformed(turn))
+    done = fmr("align", "turned.ply", folder / "cloud_bin_0.ply", "-o", "T.txt", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    degrees, metres = pose_error(read_transform(tmp_path / "T.txt") @ turn, np.linalg.inv(poses[0]) @ poses[1])
+    assert degrees < 5
+    assert metres < 0.1
+
+
 BAD = {
     "no file": (["missing.ply", "b.ply"], "missing.ply"),
     "no points": (["empty.ply", "b.ply"], "empty.ply"),
