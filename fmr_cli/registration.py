@@ -29,7 +29,6 @@ REFINED = 3  # starts that are refined, of each kind
 SURE, RIVAL = 0.95, 0.85  # once a pose is that sure, only starts that coincide nearly as much are looked at
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
-AS_GOOD = 0.5  # of the best one's odds: an alternative worth telling
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,8 @@ class Registration:
     information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's
         mean; rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.
     undetermined: the directions that the scans hardly determine, in words.
-    alternatives: other poses that fit about as well, best first: T_target_source, confidence, feature_error.
+    alternatives: other poses that would be called aligned too, as of a symmetric shape, best first: T_target_source,
+        confidence, feature_error.
     evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
     """
 
@@ -298,7 +298,6 @@ def describe(
         info = polish.information(pair.s, pair.t, best.T, np.zeros(3))
         length = pair.length / 2
         weak = polish.undetermined(info, length)
-        odds = best.confidence / max(1 - best.confidence, 1e-12)
         alternatives = [
             {
                 "T_target_source": file_pose(c.T, pair).tolist(),
@@ -306,8 +305,9 @@ def describe(
                 "feature_error": pair.feature_error(c.T),
             }
             for c in others
-            if c.confidence / max(1 - c.confidence, 1e-12) >= AS_GOOD * odds
+            if c.confidence >= verdict.ALIGNED
         ]
+        warnings = ["other poses fit about as well, see alternatives"] if alternatives else []
         before, after = pair.feature_error(local_pose(np.eye(4), pair)), pair.feature_error(best.T)
     return Registration(
         T_target_source=T,
@@ -337,6 +337,7 @@ def describe(
         },
         seconds=seconds,
         options=options,
+        warnings=warnings,
     )
 
 
