@@ -35,35 +35,29 @@ class Experiment:
     levels: tuple[tuple[float, Setting], ...]
 
 
-def _series(name: str, axis: str, values: tuple[float, ...], base: Setting, key: str) -> Experiment:
-    return Experiment(name, axis, tuple((v, replace(base, **{key: v})) for v in values))
-
-
 _start = Setting("", (0.0, 60.0), SHIFT)
+_same = replace(_start, resample=False)
 _at_40 = Setting("", (40.0, 40.0), SHIFT)
-_angles = (0, 10, 20, 30, 40, 50, 60, 70, 80, 100, 120, 140, 160, 180)
+_ANGLES = (0, 10, 20, 30, 40, 50, 60, 70, 80, 100, 120, 140, 160, 180)
 
 EXPERIMENTS = {
     e.name: e
     for e in (
-        Experiment(
-            "rotation", "initial rotation, deg", tuple((a, Setting("", (a, a), SHIFT, resample=False)) for a in _angles)
-        ),
-        _series("density", "share of the points", (1.0, 0.5, 0.25, 0.1), replace(_start, resample=False), "density"),
-        _series("noise", "standard deviation", (0.0, 0.005, 0.01, 0.02, 0.04), _start, "noise"),
-        _series("overlap", "overlap", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), _at_40, "overlap"),
-        Experiment("scenes", "largest rotation, deg", ((60.0, replace(_start, resample=False)),)),
+        Experiment("rotation", "initial rotation, deg", tuple((a, replace(_same, rotation=(a, a))) for a in _ANGLES)),
+        Experiment("density", "share of points", tuple((v, replace(_same, density=v)) for v in (1, 0.5, 0.25, 0.1))),
+        Experiment("noise", "deviation", tuple((v, replace(_start, noise=v)) for v in (0, 0.005, 0.01, 0.02, 0.04))),
+        Experiment("overlap", "overlap", tuple((v, replace(_at_40, overlap=v)) for v in (1, 0.9, 0.8, 0.7, 0.6, 0.5))),
+        Experiment("scenes", "largest rotation, deg", ((60, _same),)),
     )
 }
 
 
 @dataclass
 class Clouds:
-    """A set of clouds: points (S, M, 3) float32, normalised; size (S,): the unit box in each file's own unit."""
+    """A set of clouds: points (S, M, 3) float32, normalised; skipped: a line for each file that is left out."""
 
     name: str
     points: Tensor
-    size: np.ndarray
     skipped: list[str]
 
 
@@ -88,7 +82,8 @@ class Row:
 
 def read_clouds(path: Path, count: int | None, points: int, device: torch.device) -> Clouds:
     """The first ``count`` scans or meshes of a folder (or file), 2 x ``points`` of each. Raises FmrError."""
-    found, size, skipped = [], [], []
+    found: list[np.ndarray] = []
+    skipped: list[str] = []
     rng = np.random.default_rng(0)
     for file in find_scans([path]):
         if len(found) == count:
@@ -104,10 +99,9 @@ def read_clouds(path: Path, count: int | None, points: int, device: torch.device
             continue
         thin = voxel_downsample(cloud, extent / GRID)
         found.append(to_size(thin if len(thin) >= 2 * points else cloud, 2 * points, rng))
-        size.append(2 * np.abs(cloud - cloud.mean(0)).max())
     if not found:
         raise FmrError(f"{path}: no scan to evaluate on; the first: {skipped[0]}")
-    return Clouds(path.name or str(path), torch.from_numpy(np.stack(found)).to(device), np.array(size), skipped)
+    return Clouds(path.name or str(path), torch.from_numpy(np.stack(found)).to(device), skipped)
 
 
 def run(
@@ -121,9 +115,10 @@ def run(
             estimate = method(drawn)
             seconds = (time.perf_counter() - started) / pairs
             e = errors(estimate, drawn.truth)
+            means, medians = ([float(f(x)) for x in (e.rotation, e.translation, e.rmse)] for f in (np.mean, np.median))
             yield Row(
-                experiment.name, clouds.name, name, float(level), pairs, e.success,
-                *(float(f(x)) for x in (e.rotation, e.translation, e.rmse) for f in (np.mean, np.median)), seconds,
+                experiment.name, clouds.name, name, float(level), pairs, e.success, means[0], medians[0],
+                means[1], medians[1], means[2], medians[2], seconds,
             )  # fmt: skip
 
 

@@ -68,10 +68,14 @@ def plot_maps(path: Path, maps: dict[int, tuple[Tensor, Tensor]]) -> None:
     axes = figure.subplots(len(maps), 3, squeeze=False)
     for row, (iteration, (target, source)) in zip(axes, maps.items(), strict=True):
         low, high = float(target.min()), float(target.max())
-        images = (("target", target), (f"source, iteration {iteration}", source), ("difference", source - target))
+        images = (
+            ("target", target),
+            (f"source, iteration {iteration}", source),
+            ("difference", (source - target).abs()),
+        )
         for axis, (title, image) in zip(row, images, strict=True):
-            same = title != "difference"
-            axis.imshow(image if same else image.abs(), vmin=low if same else 0, vmax=high if same else high - low)
+            least, most = (0.0, high - low) if title == "difference" else (low, high)
+            axis.imshow(image.numpy(), vmin=least, vmax=most)
             axis.set(title=title, xticks=[], yticks=[])
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=120)

@@ -23,11 +23,11 @@ def feature(encoder: Encoder, points: Tensor) -> tuple[Tensor, Tensor]:
     x = points
     for layer in encoder.layers[:-1]:
         x = torch.relu(layer(x))
-    last = encoder.layers[-1]
+    weight, bias = encoder.layers[-1].parameters()
     with torch.no_grad(), torch.autocast(points.device.type, torch.bfloat16):
-        index = torch.nn.functional.linear(x, last.weight).max(1).indices  # [B x K]; faster on the CPU than argmax
+        index = torch.nn.functional.linear(x, weight).max(1).indices  # [B x K]; faster on the CPU than argmax
     at = x.gather(1, index[..., None].expand(-1, -1, x.shape[-1]))  # [B x K x width]
-    return torch.einsum("bkw,kw->bk", at, last.weight) + last.bias, index
+    return torch.einsum("bkw,kw->bk", at, weight) + bias, index
 
 
 def autoencoder_loss(encoder: Encoder, decoder: Decoder, points: Tensor, whole: Tensor) -> Tensor:

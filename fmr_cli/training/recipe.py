@@ -42,7 +42,7 @@ class Recipe:
     epoch_steps: int = 100
     seed: int = 0
     held_out: float = 0.15  # share of the clouds that are never trained on
-    held_out_pairs: int = 48  # registered at each setting after every epoch
+    held_out_pairs: int = 32  # registered at each setting after every epoch
     augment: Augment = field(default_factory=Augment)
 
     def __post_init__(self) -> None:

@@ -92,7 +92,7 @@ def crops_of(points: np.ndarray, count: int, cloud_points: int, rng: np.random.G
     reach = float(np.quantile(np.linalg.norm(points, axis=1), 0.9))
     if not reach > 0:
         return []
-    found = []
+    found: list[np.ndarray] = []
     for attempt in range(1 + TRIES * (count - 1)):
         if len(found) == count:
             break
@@ -132,7 +132,8 @@ def load_pairs(path: Path, cloud_points: int, seed: int) -> tuple[np.ndarray, np
     if not rows or not {"source", "target", "transform"} <= set(rows[0]):
         raise FmrError(f"{path}: needs a first line with the columns source, target, transform, and a line a pair")
     rng = np.random.default_rng(seed)
-    sources, targets = [], []
+    sources: list[np.ndarray] = []
+    targets: list[np.ndarray] = []
     for number, row in enumerate(rows, 2):
         if not all(row[name] for name in ("source", "target", "transform")):
             raise FmrError(f"{path}: line {number} lacks source, target or transform; fill it in")

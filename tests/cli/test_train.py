@@ -33,15 +33,32 @@ def recipe(tmp_path):
     return tmp_path / "tiny.toml"
 
 
-def test_train_on_scans_with_all_defaults_from_the_bundled_weights(tmp_path, fmr_here, samples):
-    done = fmr_here("train", "--unsupervised", samples, "--minutes", "0.01", cwd=tmp_path)
+def test_train_on_scans_from_the_bundled_weights(tmp_path, fmr_here, samples):
+    (tmp_path / "quick.toml").write_text("held_out_pairs = 2\ncrops = 16\n")
+    done = fmr_here("train", "--unsupervised", samples, "--recipe", "quick.toml", "--minutes", "0.01", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     run = tmp_path / "runs/train"
     assert {f.name for f in run.iterdir()} >= {
         "model.safetensors", "README.md", "recipe.toml", "metrics.csv", "state.safetensors",
     }  # fmt: skip
-    assert "48 crops of 2 scans" in (run / "README.md").read_text()
+    card = (run / "README.md").read_text()
+    assert "16 crops of 2 scans" in card
+    assert "started from base" in card
     assert "holds the start" in done.stderr or "which is kept" in done.stderr
+    aligned = fmr_here(
+        "align", samples / "scan_a.ply", samples / "scan_b.ply", "--model", "runs/train/model.safetensors", cwd=tmp_path
+    )
+    assert aligned.returncode == 0, aligned.stderr
+
+
+def test_labelled_pairs_are_trained_on(tmp_path, fmr_here, samples, recipe):
+    (tmp_path / "pairs.csv").write_text(
+        f"source,target,transform\n{samples / 'scan_a.ply'},{samples / 'scan_b.ply'},{samples / 'truth.txt'}\n"
+    )
+    done = fmr_here("train", samples, "--recipe", recipe, "--pairs", "pairs.csv", "--epochs", "1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "1 labelled pairs" in done.stderr
+    assert "loss_pose" in (tmp_path / "runs/train/metrics.csv").read_text()
 
 
 def test_the_recipe_of_a_run_gives_the_same_weights_again(tmp_path, fmr_here, samples, recipe):

@@ -16,7 +16,7 @@ from fmr_cli.weights import bundled_encoder
 
 @pytest.fixture(scope="module")
 def clouds():
-    return Clouds("others", torch.from_numpy(others(6, 1024, seed=2)), np.ones(6), [])
+    return Clouds("others", torch.from_numpy(others(6, 1024, seed=2)), [])
 
 
 def test_errors_are_the_angle_the_shift_and_the_rmse_of_the_twist():
@@ -52,12 +52,12 @@ def test_baselines_find_a_small_motion(clouds, baseline):
     assert np.median(found.rotation) < 1
 
 
-def test_the_bundled_encoder_registers_shapes_of_kinds_it_never_saw(clouds):
+@pytest.mark.parametrize("robust", [True, False])
+def test_the_bundled_encoder_registers_shapes_of_kinds_it_never_saw(clouds, robust):
     pairs = draw(clouds.points, Setting("", (40, 40), shift=0.8, resample=False), 24, 512, seed=0)
-    for robust in (True, False):
-        found = errors(ours(bundled_encoder(), 10, robust)(pairs), pairs.truth)
-        assert found.success > 0.85
-        assert found.median < 0.1
+    found = errors(ours(bundled_encoder(), 10, robust)(pairs), pairs.truth)
+    assert found.success > 0.9
+    assert found.median < 0.1
 
 
 def test_every_method_sees_the_same_pairs(clouds):
