@@ -11,6 +11,7 @@ and draws how often the poses of each confidence are right, on the half of the p
 from __future__ import annotations
 
 import argparse
+import itertools
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -71,7 +72,9 @@ def report(p: np.ndarray, y: np.ndarray) -> str:
     lines = ["confidence   poses  right"]
     for low, high in ((0, 0.1), (0.1, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.01)):
         here = (p >= low) & (p < high)
-        lines.append(f"{low:.2f} to {min(high, 1):.2f}  {here.sum():5d}  {y[here].mean() if here.any() else np.nan:.3f}")
+        lines.append(
+            f"{low:.2f} to {min(high, 1):.2f}  {here.sum():5d}  {y[here].mean() if here.any() else np.nan:.3f}"
+        )
     called = p >= 0.5
     lines.append(f"aligned: precision {y[called].mean():.4f}, recall of right poses {called[y].mean():.4f}")
     return "\n".join(lines)
@@ -84,7 +87,7 @@ def draw(p: np.ndarray, y: np.ndarray, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     edges = np.quantile(p, np.linspace(0, 1, 11))
-    bins = [(p >= a) & (p <= b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    bins = [(p >= a) & (p <= b) for a, b in itertools.pairwise(edges)]
     figure, axes = plt.subplots(figsize=(5, 5))
     axes.plot([0, 1], [0, 1], color="0.7")
     axes.plot([p[b].mean() for b in bins], [y[b].mean() for b in bins], "o-")

@@ -1,0 +1,133 @@
+"""Which starts find the pose: recall before and after refinement, and seconds, for each way to start.
+
+    python -m benchmarks.starts                   # procedural pairs, part overlap, any rotation
+    python -m benchmarks.starts --data FOLDER     # FOLDER/*.ply with *.pose.txt (cloud to world), 30 % overlap and more
+
+search and features are this tool's own. FPFH + RANSAC (Open3D) and KISS-Matcher take their place where installed, on
+the same voxel edge; each then goes through the same refinement. A start counts as found within 15 degrees and 6 voxel
+edges, a refined pose within 5 degrees and 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.io import read_cloud
+from fmr_cli.pair import Pair, Prepared, Start
+from fmr_cli.registration import Options, angle_degrees, local_pose, make_pair
+from fmr_cli.training.local import scan_pair
+
+Problem = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, target, T_target_source
+
+
+def turned(source: np.ndarray, target: np.ndarray, T: np.ndarray, rng: np.random.Generator) -> Problem:
+    """The pair with the source turned by any rotation."""
+    X = np.eye(4)
+    X[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    return transform_points(X, source), target, T @ np.linalg.inv(X)
+
+
+def procedural(count: int, seed: int) -> Iterator[Problem]:
+    for number in range(count):
+        rng = np.random.default_rng((seed, number))
+        yield turned(*scan_pair(rng), np.eye(4), rng)
+
+
+def from_folder(folder: Path, count: int, seed: int) -> Iterator[Problem]:
+    rng = np.random.default_rng(seed)
+    scans = [(read_cloud(p).points, np.loadtxt(p.with_suffix(".pose.txt"))) for p in sorted(folder.glob("*.ply"))]
+    pairs = []
+    for (target, pose_t), (source, pose_s) in itertools.combinations(scans, 2):
+        T = np.linalg.inv(pose_t) @ pose_s
+        moved = transform_points(T, source)
+        near = 1.5 * np.median(cKDTree(target).query(target, 2)[0][:, 1])
+        overlap = min(np.mean(cKDTree(a).query(b)[0] < near) for a, b in ((target, moved), (moved, target)))
+        if overlap > 0.3:
+            pairs.append((source, target, T))
+    for i in rng.permutation(len(pairs))[:count]:
+        yield turned(*pairs[i], rng)
+
+
+def fpfh(pair: Pair) -> list[Start]:
+    import open3d as o3d
+
+    reg, v = o3d.pipelines.registration, pair.edge
+
+    def describe(points: np.ndarray) -> tuple:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * v, 30))
+        return cloud, reg.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(5 * v, 100))
+
+    (s, fs), (t, ft) = describe(pair.s.points), describe(pair.t.points)
+    checks = [reg.CorrespondenceCheckerBasedOnEdgeLength(0.9), reg.CorrespondenceCheckerBasedOnDistance(1.5 * v)]
+    found = reg.registration_ransac_based_on_feature_matching(
+        s, t, fs, ft, True, 1.5 * v, reg.TransformationEstimationPointToPoint(False), 3, checks,
+        reg.RANSACConvergenceCriteria(100_000, 0.999),
+    )  # fmt: skip
+    return [Start(np.array(found.transformation), "features", [])]
+
+
+def kiss_matcher(pair: Pair) -> list[Start]:
+    import kiss_matcher as km
+
+    matcher = km.KISSMatcher(km.KISSMatcherConfig(pair.edge))
+    found = matcher.estimate(pair.source.points.astype(np.float32), pair.target.points.astype(np.float32))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = found.rotation, np.ravel(found.translation)
+    return [Start(T, "features", [])]
+
+
+def starts() -> dict[str, Callable[[Pair], list[Start]]]:
+    made: dict[str, Callable[[Pair], list[Start]]] = {"search": Pair.from_search, "features": Pair.from_features}
+    for name, module, make in (("FPFH + RANSAC", "open3d", fpfh), ("KISS-Matcher", "kiss_matcher", kiss_matcher)):
+        try:
+            __import__(module)
+            made[name] = make
+        except ImportError as error:
+            print(f"{name}: skipped ({error})")
+    return made
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--pairs", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=30_000)
+    args = parser.parse_args()
+    problems = from_folder(args.data, args.pairs, args.seed) if args.data else procedural(args.pairs, args.seed)
+    ways = starts()
+    rows: dict[str, list[tuple[bool, bool, float]]] = {name: [] for name in ways}
+    for source, target, truth in problems:
+        prepared = Prepared(PointCloud(source)), Prepared(PointCloud(target))
+        for name, way in ways.items():
+            pair = make_pair(*prepared, Options())
+            T = local_pose(truth, pair)
+            for side in prepared:  # so that every way pays for its own features
+                side._described.clear()
+            begin = time.perf_counter()
+            found = way(pair)
+            took = time.perf_counter() - begin
+            best = max(found, key=lambda s: pair.coincidence(s.T)) if found else Start(np.eye(4), name, [])
+            refined = pair.candidate(best, polished=True, scale=False).T
+            errors = [
+                (angle_degrees(np.linalg.inv(T) @ X), np.linalg.norm((X - T)[:3, 3]) / pair.edge)
+                for X in (best.T, refined)
+            ]
+            rows[name].append((errors[0][0] < 15 and errors[0][1] < 6, errors[1][0] < 5 and errors[1][1] < 2, took))
+    print(f"{'start':16s} pairs  found  refined  median s")
+    for name, row in rows.items():
+        found_share, right, seconds = np.array(row, float).T
+        print(f"{name:16s} {len(row):5d}  {found_share.mean():.3f}  {right.mean():.3f}    {np.median(seconds):.3f}")
+
+
+if __name__ == "__main__":
+    main()
