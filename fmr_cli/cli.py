@@ -256,19 +256,25 @@ def train_command(
     ] = False,
     pairs: Annotated[Path | None, typer.Option(help="Labelled pairs, CSV: source, target, transform.")] = None,
     recipe: Annotated[Path | None, typer.Option(help="All settings, .toml; options given here go before it.")] = None,
-    start: Annotated[str | None, typer.Option("--from", help="base, scratch, or weights. [default: base]")] = None,
+    start: Annotated[str | None, typer.Option("--from", help="base, scratch, or weights.", show_default="base")] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="The folder of the run.")] = Path("runs/train"),
     minutes: Annotated[float | None, typer.Option(help="Stop after so long.", min=0.0, show_default=False)] = None,
     epochs: Annotated[int | None, typer.Option(help="Stop after so many epochs.", min=1, show_default=False)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, to the same end.")] = False,
-    learning_rate: Annotated[float | None, typer.Option(help="Adam's. [default: 0.0003]", min=0.0)] = None,
-    rotation: Annotated[float | None, typer.Option(help="Of a moved copy, deg at most. [default: 45]", min=0.0)] = None,
-    shift: Annotated[float | None, typer.Option(help="Of a moved copy, its size 1. [default: 0.8]", min=0.0)] = None,
-    noise: Annotated[float | None, typer.Option(help="Largest deviation, size 1. [default: 0.02]", min=0.0)] = None,
-    density: Annotated[
-        float | None, typer.Option(help="Least share of the points. [default: 0.1]", min=0.01, max=1.0)
+    learning_rate: Annotated[float | None, typer.Option(help="Adam's.", show_default="0.0003", min=0.0)] = None,
+    rotation: Annotated[
+        float | None, typer.Option(help="Of a moved copy, deg at most.", show_default="45", min=0.0)
     ] = None,
-    overlap: Annotated[float | None, typer.Option(help="Least overlap. [default: 0.6]", min=0.1, max=1.0)] = None,
+    shift: Annotated[
+        float | None, typer.Option(help="Of a moved copy, its size 1.", show_default="0.8", min=0.0)
+    ] = None,
+    noise: Annotated[
+        float | None, typer.Option(help="Largest deviation, size 1.", show_default="0.02", min=0.0)
+    ] = None,
+    density: Annotated[
+        float | None, typer.Option(help="Least share of the points.", show_default="0.1", min=0.01, max=1.0)
+    ] = None,
+    overlap: Annotated[float | None, typer.Option(help="Least overlap.", show_default="0.6", min=0.1, max=1.0)] = None,
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same weights (CPU).", min=0)] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to train.")] = "auto",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
@@ -303,12 +309,12 @@ def evaluate_command(
     ] = "rotation,density,noise,overlap,scenes,features",
     model: Annotated[
         list[Path] | None,
-        typer.Option(help="Weights to evaluate; again for more. [default: the bundled ones]", show_default=False),
+        typer.Option(help="Weights to evaluate; again for more.", show_default="the bundled ones"),
     ] = None,
     with_baselines: Annotated[
         bool, typer.Option("--baselines", help="LM-ICP, small_gicp, and FPFH + RANSAC, KISS-Matcher where installed.")
     ] = False,
-    clouds: Annotated[int | None, typer.Option(help="Of each set, at most. [default: all]", min=1)] = None,
+    clouds: Annotated[int | None, typer.Option(help="Of each set, at most.", min=1, show_default="all")] = None,
     pairs: Annotated[int, typer.Option(help="Random pairs at each level.", min=1)] = 100,
     points: Annotated[int, typer.Option(help="Of each cloud.", min=16)] = 1024,
     iterations: Annotated[int, typer.Option(help="Of the solver.", min=1)] = 10,

@@ -36,7 +36,7 @@ class Recipe:
     unroll: int = 5  # IC iterations that the pose loss goes through
     robust: bool = True  # Geman-McClure weights in the unrolled iterations
     decoder_warmup: int = 200  # steps for a new decoder alone, where the encoder is already trained
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
     clip: float = 1.0  # largest norm of the gradient
     steps: int = 3000
     epoch_steps: int = 100

@@ -56,7 +56,7 @@ def settings(
     recipe = Recipe() if path is None else read_recipe(path)
     if unsupervised:
         changes["pose_weight"] = 0.0
-        changes["chamfer_weight"] = recipe.chamfer_weight or 1.0
+        changes |= {"chamfer_weight": recipe.chamfer_weight or 1.0, "chamfer_until": 1.0}
     if semi_supervised:
         changes["pose_weight"] = recipe.pose_weight or 1.0
     if epochs is not None:
