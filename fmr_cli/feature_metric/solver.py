@@ -29,7 +29,10 @@ RANK_TOLERANCE = 1e-9  # of the largest eigenvalue of JᵀJ
 
 @dataclass
 class Template:
-    """What the solver keeps of the target P, computed once. feature: (B, K); J: (B, K, 6); rank: (B,) of JᵀJ."""
+    """What the solver keeps of the target P, computed once. feature: (B, K); J: (B, K, 6); rank: (B,) of JᵀJ.
+
+    J is float64: the products JᵀWJ of float32 would bury the zero eigenvalues of a point or a line in rounding.
+    """
 
     feature: Tensor
     J: Tensor
@@ -58,7 +61,8 @@ def make_template(encoder: Encoder, target: Tensor, method: Literal["exact", "fi
     """F(P) and J of target (B, N, 3): "exact" through the critical points, or the paper's "finite" differences."""
     feature, index = encoder.encode(target)
     J = jacobian(encoder, target, index) if method == "exact" else finite_jacobian(encoder, target, feature)
-    eigenvalues = torch.linalg.eigvalsh((J.mT @ J).double())
+    J = J.double()
+    eigenvalues = torch.linalg.eigvalsh(J.mT @ J)
     rank = (eigenvalues > RANK_TOLERANCE * eigenvalues[:, -1:].clamp_min(1e-30)).sum(-1)
     return Template(feature, J, rank)
 
@@ -107,9 +111,9 @@ def geman_mcclure(r: Tensor, factor: float) -> Tensor:
 
 
 def weighted_step(J: Tensor, weight: Tensor, r: Tensor, basis: Tensor | None = None) -> Tensor:
-    """The capped step dtheta of (JᵀWJ) dtheta = JᵀW r: J (B or 1, K, 6), weight and r (B, K) -> (B, 6)."""
+    """The capped step dtheta of (JᵀWJ) dtheta = JᵀW r: J (B or 1, K, 6) float64, weight and r (B, K) -> (B, 6)."""
     WJ = weight[..., None] * J
-    step = constrained_step((J.mT @ WJ).double(), (WJ.mT @ r[..., None])[..., 0].double(), basis)
+    step = constrained_step(J.mT @ WJ, (WJ.mT @ r.double()[..., None])[..., 0], basis)
     return capped(step, MAX_STEP).to(r.dtype)
 
 
