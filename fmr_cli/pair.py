@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from fmr_cli import polish, verdict
@@ -36,6 +37,8 @@ FINE = LEVELS[
 ]  # enough from matched features, which are within CONSENSUS_TOLERANCE; its residual goes to the verdict
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
 POLISH_TARGET, POLISH_SOURCE = 24_000, 8_000
+EXACT_TARGET = 200_000  # points of the target that the winner is polished against once more, each its own
+COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
 POLISH_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
 SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxels
 LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
@@ -63,7 +66,7 @@ class Prepared:
         self.edge, self.spacing = working_scale(self.points, np.random.default_rng(seed))
         self._surfaces: dict[float, Surface] = {}
         self._described: dict[float, tuple[np.ndarray, Tensor]] = {}
-        self._gicp: dict[tuple[int, float], polish.GicpCloud] = {}
+        self._gicp: dict[tuple[int, float, bool], polish.GicpCloud] = {}
 
     def scaled(self, factor: float) -> Prepared:
         """The same cloud with every length multiplied by ``factor``."""
@@ -91,11 +94,13 @@ class Prepared:
         points = self.points if len(self.points) <= 4 * count else voxel_downsample(self.points, edge / 2)
         return sample(points, count, np.random.default_rng(self.seed))
 
-    def for_gicp(self, count: int, edge: float) -> polish.GicpCloud:
-        """``fine`` as small_gicp takes it."""
-        if (count, edge) not in self._gicp:
-            self._gicp[count, edge] = polish.GicpCloud(self.fine(count, edge), edge)
-        return self._gicp[count, edge]
+    def for_gicp(self, count: int, edge: float, own: bool = False) -> polish.GicpCloud:
+        """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""
+        if (count, edge, own) not in self._gicp:
+            rng = np.random.default_rng(self.seed)
+            points = sample(self.points, count, rng) if own else self.fine(count, edge)
+            self._gicp[count, edge, own] = polish.GicpCloud(points, edge)
+        return self._gicp[count, edge, own]
 
 
 @dataclass
@@ -271,6 +276,23 @@ class Pair:
         return polish.gicp(
             self.source.for_gicp(POLISH_SOURCE, self.edge), self.target.for_gicp(POLISH_TARGET, self.edge), T, self.edge
         )
+
+    def exact(self, T: np.ndarray) -> np.ndarray:
+        """The pose after a polish on the points themselves, where the one before saw a share or a grid of them.
+
+        Only where the scans have points in common, which then come to coincide; otherwise a grid is the better mean.
+        """
+        if self.motion.dof != "rigid" or not POLISH_TARGET < len(self.target.points) <= 4 * EXACT_TARGET:
+            return T
+        some = sample(self.source.points, RANKING_POINTS, np.random.default_rng(self.seed)) @ T[:3, :3].T + T[:3, 3]
+        tree = cKDTree(self.target.points, balanced_tree=False, compact_nodes=False)
+        if np.median(tree.query(some, distance_upper_bound=self.edge)[0]) > COMMON * self.target.spacing:
+            return T
+        source, target = (
+            cloud.for_gicp(count, self.edge, own=True)
+            for cloud, count in ((self.source, POLISH_SOURCE), (self.target, EXACT_TARGET))
+        )
+        return polish.gicp(source, target, T, self.edge)
 
     @torch.inference_mode()
     def feature_error(self, T: np.ndarray) -> float:

@@ -9,7 +9,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -180,6 +180,9 @@ def align(source: PointCloud | Prepared, target: PointCloud | Prepared, options:
         if best is None or candidates[0].confidence > best[2][0].confidence:
             best = pair, factor, candidates
     assert best is not None
+    if options.refine and not options.scale:
+        with stage(seconds, "polish"):
+            best[2][0] = replace(best[2][0], T=best[0].exact(best[2][0].T))
     found = describe(*best, source, options, seconds)
     seconds["total"] = time.perf_counter() - begin
     return found
