@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ import small_gicp
 
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import RegistrationError
+from fmr_cli.planes import PlaneMap
 
 WORKING_POINTS = 12_000  # what a scan is thinned to: more costs time and gains nothing measurable
 POINTS_PER_VOXEL = 4  # but no finer than the scan itself allows
@@ -26,7 +27,7 @@ MIN_POINTS = 50  # of a thinned scan, below which it is not worth a try
 
 FINE, COARSE, WIDE = 1.0, 2.0, 8.0  # edges of the map's three levels
 REACH = 3.0  # correspondences are sought within so many voxels of a map
-KEYFRAME_MOTION = 5.0  # mean displacement of the points since the last keyframe ...
+KEYFRAME_MOTION = 8.0  # mean displacement of the points since the last keyframe ...
 KEYFRAME_RISE = 1.5  # ... or the fit so much worse than right after it: then the scan joins the map
 MAP_KEYFRAMES = 25  # the map is rebuilt from so many once it holds twice as many
 
@@ -37,18 +38,24 @@ OVERLAP_DROP = 0.5  # against the running median
 OUTLIER_COST = 2.0  # what a point without counterpart costs where two poses are compared
 CONVINCING = 1.4  # a total cost above this has more starts tried; right poses have up to 1.3, wrong ones from 1.7
 LOST_AFTER = 3  # so many uncertain frames in a row, and the map is begun anew at the prediction
-PLANE_VARIANCE = 2e-3  # small_gicp's variance across a plane, scan and map together
 
 
 FeatureErrors = tuple[float, float] | None
 
 
 class Scan:
-    """A scan made ready, in voxels: ``points`` (N, 3), and ``cloud``, the same with a covariance per point."""
+    """A scan made ready, in voxels: thinned ``points`` (N, 3), ``normals`` towards the sensor, ``ranges`` from it.
 
-    def __init__(self, points: np.ndarray) -> None:
+    ``cloud`` is the same for small_gicp, with a covariance per point.
+    """
+
+    def __init__(self, points: np.ndarray, sensor: np.ndarray) -> None:
         self.cloud, _ = small_gicp.preprocess_points(points, 1.0, NEIGHBOURS, 1)
         self.points = self.cloud.points()[:, :3]
+        self.normals = self.cloud.normals()[:, :3]
+        rays = self.points - sensor
+        self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
+        self.ranges = np.linalg.norm(rays, axis=1)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -63,12 +70,13 @@ class Scan:
 
 @dataclass(frozen=True)
 class Fit:
-    """A pose against the map: (4, 4) in voxels, the share of points on the map, their mean cost."""
+    """A pose against the map: (4, 4) in voxels, the share of points on the map, their mean cost, their RMS distance."""
 
     T: np.ndarray
     overlap: float
     cost: float
     start: str
+    rms: float = float("nan")
 
     @property
     def total(self) -> float:
@@ -140,6 +148,7 @@ class LocalMap:
         self.levels = {edge: small_gicp.GaussianVoxelMap(edge) for edge in (FINE, COARSE, WIDE)}
         for level in self.levels.values():
             level.set_lru(horizon=1 << 30)
+        self.planes = PlaneMap()
 
     def insert(self, index: int, scan: Scan, T: np.ndarray) -> None:
         self.members.append((index, scan, T))
@@ -150,16 +159,22 @@ class LocalMap:
         for _, old, pose in added:
             for level in self.levels.values():
                 level.insert(old.cloud, pose)
+            self.planes.insert(old.points, old.normals, pose)
 
     def fit(self, scan: Scan, T: np.ndarray, edges: tuple[float, ...], start: str) -> Fit:
         for edge in edges:
             found = small_gicp.align(
                 self.levels[edge], scan.cloud, T, max_correspondence_distance=REACH * edge, num_threads=1,
-                max_iterations=30, rotation_epsilon=1e-5 * edge, translation_epsilon=1e-3 * edge,
+                max_iterations=30, rotation_epsilon=1e-4 * edge, translation_epsilon=1e-2 * edge,
             )  # fmt: skip
             T = found.T_target_source
         inliers = max(found.num_inliers, 1)
-        return Fit(orthonormal(T), found.num_inliers / len(scan), found.error / inliers, start)
+        return Fit(T, found.num_inliers / len(scan), found.error / inliers, start)
+
+    def polish(self, scan: Scan, fit: Fit, slope: float) -> tuple[Fit, float]:
+        """The fit with the pose that robust weights give, and how the residuals grow with range (see ``planes``)."""
+        T, rms, slope = self.planes.fit(scan.points, scan.normals, scan.ranges, fit.T, slope)
+        return replace(fit, T=orthonormal(T), rms=rms), slope
 
 
 class Odometry:
@@ -174,12 +189,15 @@ class Odometry:
         self.aligned = self.uncertain = 0  # frames in a row
         self.errors: deque[float] = deque(maxlen=5)  # of the last predictions
         self.overlaps: deque[float] = deque(maxlen=15)
+        self.slopes: deque[float] = deque(maxlen=15)
         self.fresh = np.inf  # the best fit's total since the last keyframe
         self.index = 0
 
     def prepare(self, points: np.ndarray) -> Scan | None:
         """Thin points (N, 3) and estimate their covariances; None where too little is left. Safe in another thread."""
-        scan = Scan((points - self.origin) / self.voxel) if len(points) >= MIN_POINTS else None
+        scan = (
+            Scan((points - self.origin) / self.voxel, -self.origin / self.voxel) if len(points) >= MIN_POINTS else None
+        )
         return scan if scan and len(scan) >= MIN_POINTS else None
 
     def register(self, scan: Scan | None) -> Frame:
@@ -197,6 +215,9 @@ class Odometry:
         fit, feature_errors = self._best_fit(scan, predicted)
         if not self._fits(fit):
             return self._bridge(index, scan, predicted, fit, feature_errors)
+        fit, slope = self.map.polish(scan, fit, float(np.median(self.slopes)) if self.slopes else 0.0)
+        if np.isfinite(slope):
+            self.slopes.append(slope)
         self._accept(index, scan, predicted, fit)
         return self._frame(fit.T, "aligned", fit, feature_errors)
 
@@ -258,8 +279,7 @@ class Odometry:
         return self._frame(predicted, "uncertain", fit, feature_errors)
 
     def _frame(self, T: np.ndarray, status: str, fit: Fit, feature_errors: FeatureErrors) -> Frame:
-        rmse = float(np.sqrt(2 * PLANE_VARIANCE * fit.cost) * self.voxel)
-        return Frame(self.to_file(T), status, fit.overlap, rmse, fit.start, feature_errors)
+        return Frame(self.to_file(T), status, fit.overlap, fit.rms * self.voxel, fit.start, feature_errors)
 
     def state(self) -> dict[str, Any]:
         """What ``restore`` needs besides every frame's pose in voxels (``poses[-1]`` after each); JSON types."""
@@ -268,6 +288,7 @@ class Odometry:
             "uncertain": self.uncertain,
             "errors": list(self.errors),
             "overlaps": list(self.overlaps),
+            "slopes": list(self.slopes),
             "fresh": self.fresh,
             "last": self.last[0],
             "map": [index for index, _, _ in self.map.members],
@@ -282,6 +303,7 @@ class Odometry:
         self.aligned, self.uncertain, self.fresh = state["aligned"], state["uncertain"], state["fresh"]
         self.errors.extend(state["errors"])
         self.overlaps.extend(state["overlaps"])
+        self.slopes.extend(state["slopes"])
         for index in state["map"]:
             self.map.insert(index, load(index), poses[index])
         self.last = (state["last"], load(state["last"]), poses[state["last"]])
