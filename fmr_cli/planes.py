@@ -1,0 +1,111 @@
+"""The local map as small planes, one a voxel, and the robust point-to-plane alignment that a frame's pose ends with.
+
+Lengths are in voxels. small_gicp's voxel maps reach a pose from far; but they weigh every correspondence alike, so a
+few wrong ones, or a depth camera's distorted far points, move the result by more than all the others allow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import small_gicp
+
+from fmr_cli.cloud import transform_points
+
+REACH = 1.5  # a point's plane is sought within
+FLAT = 0.8  # length of the mean normal, below which a voxel holds no plane
+AGREE = 0.7  # cosine between the normals of a point and of its plane
+ROUNDS, STEPS = 3, 2  # of looking up planes, and of solving in between
+KERNEL = 3.0  # residuals beyond so many sigma weigh little (Geman-McClure)
+MIN_SIGMA = 0.01
+MIN_SPREAD = 0.3  # of log range, to tell how residuals grow with it
+BANDS = 8  # of equal count by range from the sensor
+BITS = 21  # of a voxel's index along an axis
+
+
+class PlaneMap:
+    """Sums of points and normals by voxel; a point looks for the nearest mean."""
+
+    def __init__(self) -> None:
+        self.keys = np.zeros(0, np.int64)  # of the voxels, sorted
+        self.sums = np.zeros((0, 7))  # count, points, normals
+        self.tree: small_gicp.KdTree | None = None
+
+    def insert(self, points: np.ndarray, normals: np.ndarray, T: np.ndarray) -> None:
+        """Add a scan's points and unit normals (N, 3), moved by T."""
+        moved = transform_points(T, points)
+        cells = np.clip(np.floor(moved).astype(np.int64) + (1 << (BITS - 1)), 0, (1 << BITS) - 1)
+        keys, inverse = np.unique((cells[:, 0] << 2 * BITS) | (cells[:, 1] << BITS) | cells[:, 2], return_inverse=True)
+        values = np.concatenate([np.ones((len(points), 1)), moved, normals @ T[:3, :3].T], 1)
+        sums = np.stack([np.bincount(inverse, column, len(keys)) for column in values.T], 1)
+        place = np.searchsorted(self.keys, keys)
+        known = place < len(self.keys)
+        known[known] = self.keys[place[known]] == keys[known]
+        self.sums[place[known]] += sums[known]
+        self.keys = np.insert(self.keys, place[~known], keys[~known])
+        self.sums = np.insert(self.sums, place[~known], sums[~known], 0)
+        self.tree = None
+
+    def fit(
+        self, points: np.ndarray, normals: np.ndarray, ranges: np.ndarray, T: np.ndarray, slope: float
+    ) -> tuple[np.ndarray, float, float]:
+        """The pose near T of points with unit normals (N, 3), seen at ranges (N,).
+
+        slope: how residuals grow with range in this sensor's scans, see ``trust``. Returns the pose, the RMS distance
+        from the planes, and this scan's own slope; T as it was and NaN where too few points lie on planes.
+        """
+        if self.tree is None:
+            self.means = self.sums[:, 1:4] / self.sums[:, :1]
+            length = np.linalg.norm(self.sums[:, 4:], axis=1)
+            self.normals = self.sums[:, 4:] / np.maximum(length, 1e-9)[:, None]
+            self.flat = length / self.sums[:, 0] > FLAT
+            self.tree = small_gicp.KdTree(self.means)
+        edges = np.quantile(ranges, np.linspace(0, 1, BANDS + 1)[1:-1])
+        band = np.searchsorted(edges, ranges)
+        middle = np.log(np.quantile(ranges, (np.arange(BANDS) + 0.5) / BANDS) + 1e-9)
+        for _ in range(ROUNDS):
+            found, squared = self.tree.batch_nearest_neighbor_search(transform_points(T, points))
+            plane = np.array(found)
+            on = (np.array(squared) < REACH**2) & self.flat[plane]
+            on &= np.einsum("ij,ij->i", self.normals[plane], normals @ T[:3, :3].T) > AGREE
+            if on.sum() < 6 * BANDS:
+                return T, float("nan"), float("nan")
+            p, n, offset, b = points[on], self.normals[plane[on]], self.means[plane[on]], band[on]
+            for _ in range(STEPS):
+                moved = transform_points(T, p)
+                r = np.einsum("ij,ij->i", n, moved - offset)
+                sigma = scale_by_band(np.abs(r), b)
+                weight = trust(sigma, slope)[b] / (1 + (r / (KERNEL * sigma[b])) ** 2) ** 2
+                J = np.concatenate([np.cross(moved, n), n], 1)
+                H = np.einsum("ni,nj->ij", J, J * weight[:, None])
+                step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -(weight * r) @ J)
+                T = exponential(step) @ T
+        spread = middle - middle.mean()
+        own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
+        return T, float(np.sqrt((weight * r**2).sum() / weight.sum())), own
+
+
+def scale_by_band(r: np.ndarray, band: np.ndarray) -> np.ndarray:
+    """Sigma (BANDS,) of the residuals |r| (n,) in each range band (n,); of all where a band has few."""
+    usual = np.median(r)
+    medians = [np.median(r[band == b]) if np.count_nonzero(band == b) > 5 else usual for b in range(BANDS)]
+    return np.maximum(1.4826 * np.array(medians), MIN_SIGMA)
+
+
+def trust(sigma: np.ndarray, slope: float) -> np.ndarray:
+    """What a residual in each band is worth; sigma: (BANDS,); slope: d log sigma / d log range, as measured before.
+
+    A LiDAR's residuals grow with the range at most, as the gaps between its rays do, and far points are worth as much
+    as near ones. A depth camera's grow faster, and most of that is distortion, the same in every frame: it does not
+    average out, so there the near points decide.
+    """
+    return (sigma.min() / sigma) ** (4 * np.clip(2 * slope - 2, 0, 1))
+
+
+def exponential(step: np.ndarray) -> np.ndarray:
+    """The (4, 4) motion of a small rotation vector and a shift (6,); the rotation is exact."""
+    w, angle = step[:3], float(np.linalg.norm(step[:3]))
+    K = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+    T = np.eye(4)
+    T[:3, :3] += np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K
+    T[:3, 3] = step[3:]
+    return T
