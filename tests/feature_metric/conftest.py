@@ -1,0 +1,31 @@
+"""Fixtures of the method's tests: the bundled encoder and procedural shapes, as the encoder was trained on."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor
+
+from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.training.shapes import shapes
+from fmr_cli.weights import bundled_encoder
+
+
+@pytest.fixture(scope="session")
+def encoder() -> Encoder:
+    torch.set_num_threads(1)
+    return bundled_encoder()
+
+
+@pytest.fixture(scope="session")
+def exact_encoder(encoder: Encoder) -> Encoder:
+    """The same weights in float64, for derivatives."""
+    return copy.deepcopy(encoder).double()
+
+
+@pytest.fixture(scope="session")
+def bodies() -> Tensor:
+    """(12, 1024, 3) shapes that no training run drew, normalised, points in random order."""
+    return torch.from_numpy(shapes(12, 1024, seed=20_000))
