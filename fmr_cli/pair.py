@@ -66,6 +66,7 @@ class Prepared:
         self.edge, self.spacing = working_scale(self.points, np.random.default_rng(seed))
         self._surfaces: dict[float, Surface] = {}
         self._described: dict[float, tuple[np.ndarray, Tensor]] = {}
+        self._fine: dict[tuple[int, float], np.ndarray] = {}
         self._gicp: dict[tuple[int, float, bool], polish.GicpCloud] = {}
 
     def scaled(self, factor: float) -> Prepared:
@@ -91,8 +92,10 @@ class Prepared:
 
     def fine(self, count: int, edge: float) -> np.ndarray:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
-        points = self.points if len(self.points) <= 4 * count else voxel_downsample(self.points, edge / 2)
-        return sample(points, count, np.random.default_rng(self.seed))
+        if (count, edge) not in self._fine:
+            points = self.points if len(self.points) <= 4 * count else voxel_downsample(self.points, edge / 2)
+            self._fine[count, edge] = sample(points, count, np.random.default_rng(self.seed))
+        return self._fine[count, edge]
 
     def for_gicp(self, count: int, edge: float, own: bool = False) -> polish.GicpCloud:
         """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""
@@ -273,9 +276,14 @@ class Pair:
         if scale or self.motion.dof != "rigid":
             s, t = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
             return polish.constrained(s, t, T, self.edge, self.motion.basis().numpy(), scale)
-        return polish.gicp(
-            self.source.for_gicp(POLISH_SOURCE, self.edge), self.target.for_gicp(POLISH_TARGET, self.edge), T, self.edge
-        )
+        target = self.target.for_gicp(POLISH_TARGET, self.edge)
+        return self.gicp(self.source.fine(POLISH_SOURCE, self.edge), target, T)
+
+    def gicp(self, source: np.ndarray, target: polish.GicpCloud, T: np.ndarray) -> np.ndarray:
+        """GICP from T of those of the source's points that are in reach of the target."""
+        moved = source @ T[:3, :3].T + T[:3, 3]
+        near = source[np.isfinite(self.t.tree.query(moved, distance_upper_bound=POLISH_REACH * self.edge)[0])]
+        return T if len(near) < MIN_POINTS else polish.gicp(polish.GicpCloud(near, self.edge), target, T, self.edge)
 
     def exact(self, T: np.ndarray) -> np.ndarray:
         """The pose after a polish on the points themselves, where the one before saw a share or a grid of them.
@@ -288,11 +296,8 @@ class Pair:
         tree = cKDTree(self.target.points, balanced_tree=False, compact_nodes=False)
         if np.median(tree.query(some, distance_upper_bound=self.edge)[0]) > COMMON * self.target.spacing:
             return T
-        source, target = (
-            cloud.for_gicp(count, self.edge, own=True)
-            for cloud, count in ((self.source, POLISH_SOURCE), (self.target, EXACT_TARGET))
-        )
-        return polish.gicp(source, target, T, self.edge)
+        source = sample(self.source.points, POLISH_SOURCE, np.random.default_rng(self.seed))
+        return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, own=True), T)
 
     @torch.inference_mode()
     def feature_error(self, T: np.ndarray) -> float:
