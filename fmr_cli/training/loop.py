@@ -244,7 +244,8 @@ class Trainer:
         self.progress.steps = int(self.agreed(min(steps, self.recipe.steps)))
         self.planned = True
         self.recipe = self.recipe.changed(steps=self.progress.steps)
-        self.write(RECIPE, lambda path: path.write_text(self.recipe.toml()))
+        if self.rank == 0:
+            self.write(RECIPE, lambda path: path.write_text(self.recipe.toml()))
 
     def report(self, row: dict[str, Any] | None, loss: float, each: float, started: float) -> Report:
         progress, recipe = self.progress, self.recipe

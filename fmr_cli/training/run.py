@@ -129,7 +129,9 @@ def read_data(
             f"({', '.join(map(str, scans))}), {int(out.sum())} crops held out"
         )
     if not train:
-        raise FmrError("nothing to train on; give scans or folders of scans, or a recipe with shapes")
+        raise FmrError(
+            "nothing to train on; give scans or folders of scans (also to --resume), or a recipe with shapes"
+        )
     labelled = None
     if pairs is not None:
         a, b = load_pairs(pairs, recipe.cloud_points, recipe.seed)

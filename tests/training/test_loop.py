@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import resource
 
 import pytest
 import torch
@@ -102,3 +103,22 @@ def test_a_state_that_does_not_fit_is_one_line(tmp_path, tiny, data, whole, spoi
 def test_unknown_weights_to_start_from_are_one_line(tmp_path):
     with pytest.raises(FmrError, match="no such model file"):
         read_start(str(tmp_path / "none.safetensors"))
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, tiny, data):
+    reports = Trainer(tiny, data, tmp_path, None).run()
+    next(reports)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # stands in for the full disk
+    try:
+        with pytest.raises(FmrError, match=r"safetensors: cannot be written") as error:
+            finish_reports(reports)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(error.value)
+    kept = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    assert {name: kept[name] for name in before if name != "metrics.csv"} == {
+        name: value for name, value in before.items() if name != "metrics.csv"
+    }
+    assert not [name for name in kept if ".tmp" in name]
