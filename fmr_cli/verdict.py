@@ -64,7 +64,7 @@ def gather(source: Surface, target: Surface, T: np.ndarray, patches: float, vote
     )
 
 
-WEIGHTS = np.array([-14.0, 2.0, 10.0, 10.0, -2.0, 0.5])
+WEIGHTS = np.array([-11.649, 1.029, 0.0, 3.199, 0.0, 2.642])
 
 
 def confidence(evidence: Evidence) -> float:
