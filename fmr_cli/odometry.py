@@ -27,7 +27,7 @@ MIN_POINTS = 50  # of a thinned scan, below which it is not worth a try
 
 FINE, COARSE, WIDE = 1.0, 2.0, 8.0  # edges of the map's three levels
 REACH = 3.0  # correspondences are sought within so many voxels of a map
-KEYFRAME_MOTION = 8.0  # mean displacement of the points since the last keyframe ...
+KEYFRAME_MOTION = 10.0  # mean displacement of the points since the last keyframe ...
 KEYFRAME_RISE = 1.5  # ... or the fit so much worse than right after it: then the scan joins the map
 MAP_KEYFRAMES = 25  # the map is rebuilt from so many once it holds twice as many
 
@@ -35,8 +35,9 @@ MAP_KEYFRAMES = 25  # the map is rebuilt from so many once it holds twice as man
 # local planes over their variance, halved), whatever the sensor.
 MIN_OVERLAP, MAX_COST = 0.35, 3.0
 OVERLAP_DROP = 0.5  # against the running median
+DOUBTFUL_OVERLAP, DOUBTFUL_TOTAL = 0.85, 1.25  # against the running medians: beyond, more starts are tried
 OUTLIER_COST = 2.0  # what a point without counterpart costs where two poses are compared
-CONVINCING = 1.4  # a total cost above this has more starts tried; right poses have up to 1.3, wrong ones from 1.7
+CONVINCING = 1.4  # below such a total cost one start is enough; right poses have up to 1.3, wrong ones from 1.7
 LOST_AFTER = 3  # so many uncertain frames in a row, and the map is begun anew at the prediction
 
 
@@ -188,7 +189,7 @@ class Odometry:
         self.last: tuple[int, Scan, np.ndarray]  # index, scan, pose: the last one that could be used
         self.aligned = self.uncertain = 0  # frames in a row
         self.errors: deque[float] = deque(maxlen=5)  # of the last predictions
-        self.overlaps: deque[float] = deque(maxlen=15)
+        self.usual: deque[tuple[float, float]] = deque(maxlen=15)  # overlap and total of the last aligned frames
         self.slopes: deque[float] = deque(maxlen=15)
         self.fresh = np.inf  # the best fit's total since the last keyframe
         self.index = 0
@@ -231,12 +232,13 @@ class Odometry:
         expected = 3 * max(self.errors, default=np.inf)
         if self.aligned > 2:
             fit = self.map.fit(scan, predicted, (FINE,) if expected < FINE else (COARSE, FINE), "prediction")
-            if self._fits(fit) and displacement(fit.T, predicted, scan.points) < expected + COARSE:
+            if self._usual(fit) and displacement(fit.T, predicted, scan.points) < expected + COARSE:
                 return fit, None
         starts = {"prediction": predicted, "still": self.poses[-1]} if len(self.poses) > 1 else {"still": predicted}
         fits = [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
         best = min(fits, key=lambda fit: fit.total)
-        if best.total < CONVINCING and self._fits(best):
+        agreed = len(fits) > 1 and displacement(fits[0].T, fits[1].T, scan.points) < FINE / 2
+        if self._fits(best) and (agreed or best.total < CONVINCING):
             return best, None
         T, feature_errors = self._feature_start(scan)
         return min(best, self.map.fit(scan, T, (COARSE, FINE), "features"), key=lambda fit: fit.total), feature_errors
@@ -247,16 +249,21 @@ class Odometry:
 
         _, last, pose = self.last
         found = align(scan.prepared, last.prepared, Options(refine=False))
-        return pose @ found.T_target_source, (found.feature_errors[0], found.feature_errors[-1])
+        return pose @ found.T_target_source, (found.feature_error_before, found.feature_error_after)
 
     def _fits(self, fit: Fit) -> bool:
-        usual = float(np.median(self.overlaps)) if self.overlaps else 0.0
+        usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
         return fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST
+
+    def _usual(self, fit: Fit) -> bool:
+        """Whether the fit is as good as the last ones; a scanner's rings on the ground hold it where it was, too."""
+        overlap, total = np.median(self.usual, axis=0)
+        return self._fits(fit) and fit.overlap > DOUBTFUL_OVERLAP * overlap and fit.total < DOUBTFUL_TOTAL * total
 
     def _accept(self, index: int, scan: Scan, predicted: np.ndarray, fit: Fit) -> None:
         if len(self.poses) > 1:
             self.errors.append(displacement(fit.T, predicted, scan.points))
-        self.overlaps.append(fit.overlap)
+        self.usual.append((fit.overlap, fit.total))
         self.aligned, self.uncertain = self.aligned + 1, 0
         self.poses, self.last = [self.poses[-1], fit.T], (index, scan, fit.T)
         self.fresh = min(self.fresh, fit.total)
@@ -275,7 +282,7 @@ class Odometry:
             if self.uncertain >= LOST_AFTER:  # the old map is out of sight: what follows is at least right in itself
                 self.map, self.uncertain, self.fresh = LocalMap(), 0, np.inf
                 self.map.insert(index, scan, predicted)
-                self.overlaps.clear()
+                self.usual.clear()
         return self._frame(predicted, "uncertain", fit, feature_errors)
 
     def _frame(self, T: np.ndarray, status: str, fit: Fit, feature_errors: FeatureErrors) -> Frame:
@@ -287,7 +294,7 @@ class Odometry:
             "aligned": self.aligned,
             "uncertain": self.uncertain,
             "errors": list(self.errors),
-            "overlaps": list(self.overlaps),
+            "usual": list(self.usual),
             "slopes": list(self.slopes),
             "fresh": self.fresh,
             "last": self.last[0],
@@ -302,7 +309,7 @@ class Odometry:
         self.index, self.poses = len(poses), poses[-2:]
         self.aligned, self.uncertain, self.fresh = state["aligned"], state["uncertain"], state["fresh"]
         self.errors.extend(state["errors"])
-        self.overlaps.extend(state["overlaps"])
+        self.usual.extend((overlap, total) for overlap, total in state["usual"])
         self.slopes.extend(state["slopes"])
         for index in state["map"]:
             self.map.insert(index, load(index), poses[index])

@@ -1,0 +1,175 @@
+"""`fmr sequence`: a trajectory, whatever the folder holds and whatever happens to the process."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from fmr_cli import PointCloud, read_cloud, write_cloud
+from fmr_cli.io import read_poses
+from simulation import drive, make_street, scan
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory):
+    """A folder of KITTI .bin scans of a drive that is in motion from its first scan on, and the true poses."""
+    folder = tmp_path_factory.mktemp("street")
+    rng, place, poses = np.random.default_rng(1), make_street(60), drive(60)[:FRAMES]
+    for i, pose in enumerate(poses):
+        points = scan(place, pose, rng, columns=450)
+        write_cloud(folder / f"{i}.bin", PointCloud(points, {"intensity": np.full(len(points), i, np.float32)}))
+    return folder, np.linalg.inv(poses[0]) @ poses
+
+
+def copy(street, tmp_path):
+    folder = tmp_path / "scans"
+    shutil.copytree(street[0], folder)
+    return folder
+
+
+def table(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_poses_residuals_and_map_of_a_moving_start(fmr_here, street, tmp_path):
+    folder, truth = street
+    done = fmr_here(
+        "sequence", folder, "--out", tmp_path / "poses.txt", "--residuals", tmp_path / "r.csv",
+        "--merged", tmp_path / "map.ply",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    poses = read_poses(tmp_path / "poses.txt")
+    assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.03
+    rows = table(tmp_path / "r.csv")
+    assert [row["file"] for row in rows] == [f"{i}.bin" for i in range(FRAMES)]
+    assert all(row["status"] == "aligned" for row in rows)
+    assert float(rows[3]["motion"]) == pytest.approx(0.8, abs=0.02)
+    merged = read_cloud(tmp_path / "map.ply")
+    assert len(merged) < sum(int(row["points"]) for row in rows)
+    assert np.array_equal(merged.attributes["frame"], merged.attributes["intensity"])
+    assert not (tmp_path / "poses.txt.journal").exists()
+
+
+def test_natural_order_and_a_choice_of_scans(fmr_here, street, tmp_path):
+    folder = copy(street, tmp_path)
+    (folder / "7.bin").rename(folder / "10.bin")
+    done = fmr_here(
+        "sequence", folder, "--out", tmp_path / "p.json", "--format", "json", "--start", 2, "--step", 2,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert [frame["file"] for frame in json.loads((tmp_path / "p.json").read_text())["frames"]] == [
+        "2.bin", "4.bin", "6.bin",
+    ]  # fmt: skip
+
+
+def test_kitti_folder_with_times_and_calibration(fmr_here, street, tmp_path):
+    root = tmp_path / "00"
+    shutil.copytree(street[0], root / "velodyne")
+    Tr = np.array([[0.0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]])
+    (root / "calib.txt").write_text("P0: 1 2 3\nTr: " + " ".join(map(str, Tr.ravel())) + "\n")
+    (root / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(FRAMES)))
+    assert fmr_here("sequence", root, "--out", tmp_path / "s.txt", "--stop", 3).returncode == 0
+    assert fmr_here("sequence", root, "--out", tmp_path / "c.txt", "--stop", 3, "--camera-frame").returncode == 0
+    assert fmr_here("sequence", root, "--out", tmp_path / "t.txt", "--stop", 3, "--format", "tum").returncode == 0
+    T = np.vstack([Tr, [0, 0, 0, 1]])
+    expected = T @ read_poses(tmp_path / "s.txt") @ np.linalg.inv(T)
+    assert np.allclose(read_poses(tmp_path / "c.txt"), expected, atol=1e-12)
+    tum = np.loadtxt(tmp_path / "t.txt")
+    assert np.allclose(tum[:, 0], [0, 0.1, 0.2])
+    assert np.allclose(tum[:, 1:4], read_poses(tmp_path / "s.txt")[:, :3, 3])
+
+
+def test_a_list_of_scans(fmr_here, street, tmp_path):
+    (tmp_path / "scans.txt").write_text("".join(f"{street[0] / f'{i}.bin'}\n" for i in (0, 1, 2)))
+    assert fmr_here("sequence", tmp_path / "scans.txt", "--out", tmp_path / "p.txt").returncode == 0
+    assert len(read_poses(tmp_path / "p.txt")) == 3
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "other unit"])
+def test_a_bad_scan_is_bridged_and_named(fmr_here, street, tmp_path, damage):
+    folder, truth = copy(street, tmp_path), street[1]
+    bad = folder / "4.bin"
+    if damage == "truncated":
+        bad.write_bytes(bad.read_bytes()[:1001])
+    elif damage == "empty":
+        bad.write_bytes(b"")
+    else:
+        write_cloud(bad, PointCloud(read_cloud(bad).points * 1000))
+    done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", "--residuals", tmp_path / "r.csv")
+    assert done.returncode == 3
+    assert "1 uncertain, look at: 4 (4.bin)" in done.stderr
+    assert "frame 4 is bridged" in done.stderr
+    assert [row["status"] for row in table(tmp_path / "r.csv")].count("uncertain") == 1
+    poses = read_poses(tmp_path / "p.txt")
+    assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.05
+
+
+def test_not_finite_points_are_left_out(fmr_here, street, tmp_path):
+    folder = copy(street, tmp_path)
+    rows = np.fromfile(folder / "2.bin", np.float32).reshape(-1, 4)
+    rows[::50, 1] = np.nan
+    rows.tofile(folder / "2.bin")
+    assert fmr_here("sequence", folder, "--out", tmp_path / "p.txt").returncode == 0
+
+
+def test_of_two_formats_one_is_taken_and_named(fmr_here, street, tmp_path):
+    folder = copy(street, tmp_path)
+    write_cloud(folder / "extra.ply", read_cloud(folder / "0.bin"))
+    (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", "--stop", 2)
+    assert done.returncode == 0
+    assert f"the {FRAMES} .bin files are taken, 1 .ply left out" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda folder: None, "holds no scans"),
+        (lambda folder: (folder / "a.bin").write_bytes(b"0" * 1600), "one scan only"),
+    ],
+)
+def test_too_few_scans_are_one_line(fmr_here, tmp_path, make, says):
+    (tmp_path / "scans").mkdir()
+    make(tmp_path / "scans")
+    done = fmr_here("sequence", tmp_path / "scans", "--out", tmp_path / "p.txt")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert says in done.stderr
+    assert not (tmp_path / "p.txt").exists()
+
+
+def test_camera_frame_without_calibration_is_one_line(fmr_here, street, tmp_path):
+    done = fmr_here("sequence", street[0], "--out", tmp_path / "p.txt", "--camera-frame")
+    assert done.returncode == 2
+    assert "no calib.txt" in done.stderr
+
+
+def test_killed_and_resumed_it_comes_to_the_same_poses(fmr_here, street, tmp_path):
+    folder = street[0]
+    assert fmr_here("sequence", folder, "--out", tmp_path / "whole.txt").returncode == 0
+    out, residuals = tmp_path / "p.txt", tmp_path / "r.csv"
+    command = [sys.executable, "-m", "fmr_cli.cli", "sequence", folder, "--out", out, "--residuals", residuals]
+    process = subprocess.Popen([str(part) for part in command], stderr=subprocess.DEVNULL)
+    while process.poll() is None and not (out.exists() and out.read_text().count("\n") >= 3):
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert 3 <= out.read_text().count("\n") < FRAMES
+    other = fmr_here("sequence", folder, "--out", out, "--residuals", residuals, "--resume", "--voxel-size", 1)
+    assert other.returncode == 2
+    assert "voxel_size" in other.stderr
+    assert fmr_here("sequence", folder, "--out", out, "--residuals", residuals, "--resume").returncode == 0
+    assert np.abs(read_poses(out) - read_poses(tmp_path / "whole.txt")).max() < 1e-9
+    assert [row["frame"] for row in table(residuals)] == [str(i) for i in range(FRAMES)]
