@@ -2,8 +2,9 @@
 
     python -m benchmarks.calibrate --pairs 400 --out calibration/
 
-Half of the pairs are two scans of one scene, from little to full overlap; a quarter of the scans are thinned and noisy.
-The others are scans of two different scenes, where no pose is right. Every pose that ``align`` would judge counts,
+Half of the pairs are two scans of one scene, from little to full overlap; a fifth are halves of one scan, some of them
+flattened; the others are scans of two different scenes, where no pose is right. Many are thinned, noisy, or hold things
+that the other scan does not. Every pose that ``align`` would judge counts,
 so that the wrong ones are the plausible ones. No real scan is involved. Prints the weights for ``fmr_cli/verdict.py``,
 and draws how often the poses of each confidence are right, on the half of the pairs that was not fitted.
 """
@@ -30,15 +31,39 @@ RIGHT_DEGREES, RIGHT_EDGES = 5.0, 2.0
 RIDGE = 3e-3
 
 
+def scans(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Two scans, and whether they belong together; in the scene's frame where they do."""
+    source, target = scan_pair(rng)
+    kind = rng.choice(["views", "halves", "strangers"], p=[0.5, 0.2, 0.3])
+    if kind == "strangers":
+        source, _ = scan_pair(rng)
+    if kind == "halves":
+        if rng.random() < 0.3:  # sheets, reliefs
+            target = target * np.where(np.arange(3) == rng.integers(3), rng.uniform(0.01, 0.3), 1.0)
+        order = rng.permutation(len(target))
+        source, target = target[order[::2]], target[order[1::2]]
+    if rng.random() < 0.4:
+        source, target = degrade(source, rng), degrade(target, rng)
+    if rng.random() < 0.4:  # what moved, grew or was not there: up to a third of a scan is the scan's own
+        source, target = clutter(source, rng), clutter(target, rng)
+    return source, target, kind != "strangers"
+
+
+def clutter(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The scan with points of its own in blobs about some of its points."""
+    size = np.ptp(points, axis=0).max()
+    blobs = [points]
+    for _ in range(rng.integers(1, 40)):
+        count = int(rng.uniform(0, 0.012) * len(points))
+        spread = rng.uniform(0.003, 0.04, 3) * size
+        blobs.append(points[rng.integers(len(points))] + rng.normal(size=(count, 3)) * spread)
+    return np.concatenate(blobs)
+
+
 def poses(seed: tuple[int, int]) -> list[tuple[np.ndarray, bool]]:
     """The evidence at each candidate pose of one fresh pair, and whether the pose is right."""
     rng = np.random.default_rng(seed)
-    together = bool(rng.random() < 0.7)
-    source, target = scan_pair(rng)
-    if not together:
-        source, _ = scan_pair(rng)
-    if rng.random() < 0.25:
-        source, target = degrade(source, rng), degrade(target, rng)
+    source, target, together = scans(rng)
     if min(len(source), len(target)) < 500:
         return []
     move = np.eye(4)
@@ -64,8 +89,8 @@ def poses(seed: tuple[int, int]) -> list[tuple[np.ndarray, bool]]:
 def fit(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Weights w that minimise the logistic loss of y (0/1) on x w, with a small ridge on the standardised columns.
 
-    Each kind of evidence may only speak in its own sense (less patch error is better, more of all else), so that what
-    one kind happens to say about another in these scans does not count elsewhere.
+    No kind of evidence may count against its own sense: what one kind happens to say about another in these scans need
+    not hold elsewhere.
     """
     spread = np.append(1.0, x[:, 1:].std(0))
 
@@ -73,7 +98,7 @@ def fit(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         z = (x / spread) @ w
         return float(np.mean(np.logaddexp(0, z) - y * z) + RIDGE * (w[1:] ** 2).mean())
 
-    bounds = [(None, None), (0, None), (0, None), (0, None), (None, 0), (0, None)]
+    bounds = [(None, None)] + [(0, None)] * (x.shape[1] - 1)
     return minimize(loss, np.zeros(x.shape[1]), method="L-BFGS-B", bounds=bounds).x / spread
 
 

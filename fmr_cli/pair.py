@@ -20,7 +20,7 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.feature_metric.consensus import consensus, match
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
-from fmr_cli.feature_metric.motion import Motion
+from fmr_cli.feature_metric.motion import Motion, rotations
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.feature_metric.search import STARTS, search
 from fmr_cli.feature_metric.solver import make_template, solve
@@ -35,6 +35,8 @@ LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coa
 FINE = LEVELS[
     1:
 ]  # enough from matched features, which are within CONSENSUS_TOLERANCE; its residual goes to the verdict
+DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
+CHANCE_POSES = 8
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
 POLISH_TARGET, POLISH_SOURCE = 24_000, 8_000
 EXACT_TARGET = 200_000  # points of the target that the winner is polished against once more, each its own
@@ -193,13 +195,18 @@ class Pair:
         distance = np.linalg.norm(x @ T[:3, :3].T + T[:3, 3] - y, axis=1)
         return int((distance < CONSENSUS_TOLERANCE * self.edge).sum())
 
-    def from_features(self) -> list[Start]:
-        """Matched local features and their spatial consensus: any rotation, part overlap."""
+    @cached_property
+    def agreed(self) -> list[tuple[np.ndarray, int, float]]:
+        """Poses that matches agree on, best first, each with its votes and its coincidence."""
         x, y = (torch.from_numpy((k / self.edge).astype(np.float32)) for k in self.matches)
         motion = Motion(self.motion.dof, self.motion.up, self.motion.lift / self.edge)
         T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0].double().numpy()
         T[:, :3, 3] *= self.edge
-        return [Start(pose, "features", []) for pose in T]
+        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in T]
+
+    def from_features(self) -> list[Start]:
+        """Matched local features and their spatial consensus: any rotation, part overlap."""
+        return [Start(T, "features", []) for T, _, _ in self.agreed]
 
     @torch.inference_mode()
     def from_search(self) -> list[Start]:
@@ -215,7 +222,8 @@ class Pair:
 
     @torch.inference_mode()
     def from_pose(self, T: np.ndarray, name: str) -> list[Start]:
-        """A pose as it is, and where the IC solver of the paper goes from there."""
+        """A pose as it is (but for what the motion does not allow), and where the IC solver of the paper goes from it."""
+        T = self.motion.exact(torch.from_numpy(T)).numpy()
         g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
         template = make_template(self.encoder, self.P)
         found = solve(self.encoder, template, self.Q, g, self.iterations, self.robust, self.motion.basis())
@@ -261,11 +269,41 @@ class Pair:
 
     def judged(self, T: np.ndarray, start: Start, patches: float) -> Candidate:
         """A pose with the evidence gathered at it; patches: the median patch error there."""
-        return Candidate(T, start.name, start.errors, verdict.gather(self.s, self.t, T, patches, self.votes(T)))
+        votes, coincidence = self.votes(T), self.coincidence(T)
+        rivals = [(v, c) for pose, v, c in self.agreed if not self.same(T, pose)]
+        fit = verdict.fit(self.s, self.t, T)
+        return Candidate(
+            T,
+            start.name,
+            start.errors,
+            verdict.Evidence(
+                **fit,
+                patches=patches if np.isfinite(patches) else 1.0,
+                votes=votes,
+                votes_over_rival=(votes + 1) / (max((v for v, _ in rivals), default=0) + 1),
+                fit_over_rival=coincidence / max(max((c for _, c in rivals), default=coincidence), 1e-3),
+                contrast=self.chance_error / max(self.feature_error(T), 1e-9),
+            ),
+        )
+
+    def same(self, a: np.ndarray, b: np.ndarray) -> bool:
+        """Whether two poses are one, but for what a refinement moves."""
+        D = np.linalg.inv(a) @ b
+        angle = np.degrees(np.arccos(np.clip((np.trace(D[:3, :3]) - 1) / 2, -1, 1)))
+        return bool(angle < DISTINCT_DEGREES and np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge)
+
+    @cached_property
+    def chance_error(self) -> float:
+        """The median of the global feature's error over a few rotations that are as good as random."""
+        g = rotations(CHANCE_POSES).to(self.Q)
+        with torch.inference_mode():
+            template = make_template(self.encoder, self.P)
+            return float(solve(self.encoder, template, self.Q.expand(len(g), -1, -1), g, 0).error.median())
 
     def candidate(self, start: Start, polished: bool, scale: bool) -> Candidate:
         """A start, refined patch by patch, polished where asked, and judged."""
-        T, patches = self.refine(start.T, FINE if start.name == "features" else LEVELS, PATCH_ITERATIONS)
+        T = self.motion.exact(torch.from_numpy(start.T)).numpy()
+        T, patches = self.refine(T, FINE if start.name == "features" else LEVELS, PATCH_ITERATIONS)
         if polished:
             T = self.polished(T, scale)
             _, patches = self.refine(T, FINE, 0)

@@ -28,7 +28,6 @@ Init = Literal["auto", "search", "features", "centroid", "identity"]
 REFINED = 3  # starts that are refined, of each kind
 SURE, RIVAL = 0.95, 0.85  # once a pose is that sure, only starts that coincide nearly as much are looked at
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
-DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
 
 
 @dataclass(frozen=True)
@@ -226,7 +225,7 @@ def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candid
     if not candidates:  # every pose found lies beyond --max-angle or --max-shift
         here = Start(local_pose(np.eye(4), pair), "identity", [])
         candidates = [pair.judged(here.T, here, float("nan"))]
-    return distinct(candidates, pair.edge)
+    return distinct(candidates, pair)
 
 
 def start_makers(pair: Pair, options: Options) -> list[tuple[str, Callable[[], list[Start]]]]:
@@ -267,16 +266,11 @@ def within_bounds(T: np.ndarray, pair: Pair, options: Options) -> bool:
     )
 
 
-def distinct(candidates: list[Candidate], edge: float) -> list[Candidate]:
+def distinct(candidates: list[Candidate], pair: Pair) -> list[Candidate]:
     """The candidates without those that are another, better one's pose."""
     kept: list[Candidate] = []
     for c in candidates:
-        apart = (
-            angle_degrees(np.linalg.inv(c.T) @ k.T) > DISTINCT_DEGREES
-            or np.linalg.norm(c.T[:3, 3] - k.T[:3, 3]) > DISTINCT_EDGES * edge
-            for k in kept
-        )
-        if all(apart):
+        if not any(pair.same(c.T, k.T) for k in kept):
             kept.append(c)
     return kept
 

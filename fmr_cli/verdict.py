@@ -25,6 +25,9 @@ class Evidence:
     normals: mean |cosine| between the normals of touching points.
     patches: median patch residual at the pose over the patches' mean feature norm; 1 where none is co-occupied.
     votes: how many matches of local features agree with the pose, whether or not it came from them.
+    votes_over_rival, fit_over_rival: the votes (plus one) and the share of the source that coincides with the target,
+        each over the most that another pose has, which matches agree on but which was rejected.
+    contrast: the global feature's error at a pose as good as random, over that at this one.
     """
 
     overlap: float
@@ -33,38 +36,41 @@ class Evidence:
     normals: float
     patches: float
     votes: int
+    votes_over_rival: float
+    fit_over_rival: float
+    contrast: float
 
     def vector(self) -> np.ndarray:
-        """What the logistic model sees."""
-        logs = np.log(np.maximum([self.overlap, self.patches], 1e-3))
-        return np.array([1.0, logs[0], self.near, self.normals, logs[1], np.log1p(self.votes)])
+        """What the logistic model sees, after a 1 for the intercept: of each kind of evidence, more is better."""
+        ratios = [self.overlap, self.votes_over_rival, self.fit_over_rival, self.contrast, 1 / max(self.patches, 1e-3)]
+        return np.array([1.0, self.near, self.normals, np.log1p(self.votes), *np.log(np.clip(ratios, 1e-2, 1e2))])
 
 
-def gather(source: Surface, target: Surface, T: np.ndarray, patches: float, votes: int) -> Evidence:
-    """Evidence at T (4x4, source to target, in the surfaces' frames); both surfaces on the same voxel edge."""
+def fit(source: Surface, target: Surface, T: np.ndarray) -> dict[str, float]:
+    """How the surfaces fit at T (4x4, source to target, in their frames), both on the same voxel edge.
+
+    Returns the ``Evidence`` that geometry gives: overlap, inlier_rmse, near, normals.
+    """
     edge = target.edge
     moved = source.points @ T[:3, :3].T + T[:3, 3]
-    back = (target.points - T[:3, 3]) @ T[:3, :3]
+    back = (target.points - T[:3, 3]) @ np.linalg.inv(T[:3, :3]).T
     forth_d, forth_i = target.tree.query(moved, distance_upper_bound=AROUND * edge)
     back_d = source.tree.query(back, distance_upper_bound=AROUND * edge)[0]
     touching = np.concatenate([forth_d, back_d])
     touching = touching[touching < TOUCHING * edge]
-    overlap = max(np.mean(forth_d < TOUCHING * edge), np.mean(back_d < TOUCHING * edge))
     around = np.isfinite(forth_d).sum() + np.isfinite(back_d).sum()
     near = (forth_d < NEAR * edge).sum() + (back_d < NEAR * edge).sum()
     here = np.flatnonzero(forth_d < TOUCHING * edge)
     cosine = np.einsum("ni,ni->n", source.normals[here] @ T[:3, :3].T, target.normals[forth_i[here]])
-    return Evidence(
-        overlap=float(overlap),
-        inlier_rmse=float(np.sqrt(np.mean(touching**2))) if len(touching) else float("inf"),
-        near=float(near / max(around, 1)),
-        normals=float(np.abs(cosine).mean()) if len(here) else 0.0,
-        patches=patches if np.isfinite(patches) else 1.0,
-        votes=votes,
-    )
+    return {
+        "overlap": float(max(np.mean(forth_d < TOUCHING * edge), np.mean(back_d < TOUCHING * edge))),
+        "inlier_rmse": float(np.sqrt(np.mean(touching**2))) if len(touching) else float("inf"),
+        "near": float(near / max(around, 1)),
+        "normals": float(np.abs(cosine).mean()) if len(here) else 0.0,
+    }
 
 
-WEIGHTS = np.array([-11.649, 1.029, 0.0, 3.199, 0.0, 2.642])
+WEIGHTS = np.array([-13.0, 2.0, 3.0, 2.0, 1.0, 1.0, 1.0, 0.5, 0.0])
 
 
 def confidence(evidence: Evidence) -> float:
