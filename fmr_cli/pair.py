@@ -222,7 +222,7 @@ class Pair:
 
     @torch.inference_mode()
     def from_pose(self, T: np.ndarray, name: str) -> list[Start]:
-        """A pose as it is (but for what the motion does not allow), and where the IC solver of the paper goes from it."""
+        """The allowed pose next to T, and where the IC solver of the paper goes from it."""
         T = self.motion.exact(torch.from_numpy(T)).numpy()
         g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
         template = make_template(self.encoder, self.P)

@@ -141,6 +141,6 @@ def undetermined(info: np.ndarray, length: float) -> list[str]:
         axis = omega if np.linalg.norm(omega) > np.linalg.norm(v) else v
         axis = axis / np.linalg.norm(axis)
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-        where = "({:.2f}, {:.2f}, {:.2f})".format(*(axis + 0.0))
+        where = "({:.2f}, {:.2f}, {:.2f})".format(*(np.round(axis, 2) + 0.0))  # no -0.00
         said.append(f"rotation about {where}" if np.linalg.norm(omega) > np.linalg.norm(v) else f"shift along {where}")
     return said

@@ -47,6 +47,20 @@ class Motion:
         twist = torch.cat([turns[:, None] * torch.tensor(self.up, dtype=torch.float64), torch.zeros(len(turns), 3)], 1)
         return se3.exp(twist)
 
+    def exact(self, T: Tensor) -> Tensor:
+        """The allowed motion next to T (..., 4, 4) float64: what float32 arithmetic has rounded, put right."""
+        up = torch.tensor(self.up, dtype=T.dtype)
+        q = se3.quaternion(T[..., :3, :3])
+        if self.dof == "translation":
+            q = torch.tensor([1.0, 0, 0, 0], dtype=T.dtype).expand_as(q)
+        elif self.dof != "rigid":
+            q = torch.cat([q[..., :1], (q[..., 1:] @ up)[..., None] * up], -1)
+        T = T.clone()
+        T[..., :3, :3] = se3.from_quaternion(q / q.norm(dim=-1, keepdim=True))
+        if self.dof == "planar":
+            T[..., :3, 3] += (self.lift - T[..., :3, 3] @ up)[..., None] * up
+        return T
+
     def fit(self, source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
         """The weighted least squares motion: source, target (B, n, 3), weight (B, n) -> (B, 4, 4).
 

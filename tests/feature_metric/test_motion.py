@@ -81,6 +81,19 @@ def test_the_fit_finds_the_motion_that_it_may(dof: str) -> None:
     torch.testing.assert_close(found, T.expand(2, 4, 4), rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("dof", ["rigid", "yaw", "translation", "planar"])
+def test_float32_rounding_is_put_right_within_the_subgroup(dof: str) -> None:
+    T, motion = allowed(dof, 0.3), Motion(dof, UP, lift=0.3)  # type: ignore[arg-type]
+    exact = motion.exact(T.float().double()[None])[0]
+    torch.testing.assert_close(exact, T, rtol=0, atol=1e-6)
+    R, up = exact[:3, :3], torch.tensor(UP, dtype=torch.float64)
+    torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-15)
+    if dof != "rigid":
+        torch.testing.assert_close(R @ up, up, rtol=0, atol=1e-15)
+    if dof == "planar":
+        assert abs(float(exact[:3, 3] @ up) - 0.3) < 1e-15
+
+
 def test_flat_matches_are_turned_not_mirrored() -> None:
     x = torch.randn(1, 20, 3, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.0])
     T = Motion().fit(x, x * torch.tensor([1.0, -1.0, 1.0]), torch.ones(1, 20, dtype=torch.float64))
