@@ -169,6 +169,9 @@ def sequence_command(
     voxel_size: Annotated[
         float | None, typer.Option(help="The working voxel edge. [default: by the data]", min=0.0)
     ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="True poses, KITTI rows: errors beside --out as .evaluation.json and .png.")
+    ] = None,
     start: Annotated[int, typer.Option(help="The first scan, counted from 0.", min=0)] = 0,
     stop: Annotated[int | None, typer.Option(help="The scan before which to stop. [default: the last]", min=0)] = None,
     step: Annotated[int, typer.Option(help="Take every so many-th scan.", min=1)] = 1,
@@ -184,6 +187,10 @@ def sequence_command(
     found = find_scans(scans, start, stop, step, [path for path in (out, residuals, merged) if path])
     for note in [] if quiet else found.notes:
         say(note)
+    if truth:
+        from fmr_cli import trajectory_eval
+
+        true = trajectory_eval.read_truth(truth, found.chosen, found.total)
     sequence = Sequence(
         found, out, form=form, camera_frame=camera_frame, residuals=residuals, merged=merged,
         merged_voxel=merged_voxel or None, voxel_size=voxel_size or None,
@@ -196,6 +203,13 @@ def sequence_command(
                 say(f"frame {row['frame']} is bridged: {row['message']}")
     for line in [] if quiet else sequence.summary():
         say(line)
+    if truth:
+        poses = sequence.trajectory()
+        errors = trajectory_eval.evaluate(poses, true)
+        outputs.write_json(out.with_suffix(".evaluation.json"), errors)
+        trajectory_eval.plot(out.with_suffix(".png"), poses, true)
+        for line in [] if quiet else trajectory_eval.summary(errors):
+            say(line)
     if sequence.uncertain:
         if not quiet:
             names = ", ".join(f"{row['frame']} ({row['file']})" for row in sequence.uncertain[:20])

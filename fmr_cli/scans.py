@@ -20,12 +20,14 @@ TEXT = {".txt", ".csv"}  # beside scans of another format these are poses, times
 
 @dataclass(frozen=True)
 class Scans:
-    """files: in order. times: one a file, seconds, or None. T_camera_scan: (4, 4), calib.txt's Tr, or None.
+    """files: in order; ``chosen`` are their places among all ``total``. times: one a file, seconds, or None.
 
-    notes: what a person should know about the choice, a line each.
+    T_camera_scan: (4, 4), calib.txt's Tr, or None. notes: what a person should know about the choice, a line each.
     """
 
     files: list[Path]
+    chosen: range
+    total: int
     times: np.ndarray | None
     T_camera_scan: np.ndarray | None
     notes: list[str] = field(default_factory=list)
@@ -55,7 +57,8 @@ def find_scans(
         what = f"{len(files)} scans, {len(chosen)} of them chosen" if len(chosen) < len(files) else "one scan only"
         raise CloudFileError(f"{path}: {what}, a sequence has two or more (formats: {' '.join(SUFFIXES)})")
     times = read_times(home, len(files)) if path.is_dir() else None
-    return Scans([files[i] for i in chosen], None if times is None else times[chosen], read_calibration(home), notes)
+    times = None if times is None else times[np.array(chosen)]
+    return Scans([files[i] for i in chosen], chosen, len(files), times, read_calibration(home), notes)
 
 
 def in_folder(folder: Path, outputs: set[Path], notes: list[str]) -> list[Path]:

@@ -254,6 +254,10 @@ class Sequence:
         pose = self.poses[index]
         return pose if self.T_camera_scan is None else self.T_camera_scan @ pose @ np.linalg.inv(self.T_camera_scan)
 
+    def trajectory(self) -> np.ndarray:
+        """(n, 4, 4): every frame's ``pose``."""
+        return np.stack([self.pose(index) for index in range(len(self.poses))])
+
     def _finish(self) -> None:
         if self.form == "json":
             frames = [

@@ -74,8 +74,8 @@ def drive(size: float, speed: float = 8.0, turn: float = 40.0, rest: int = 5) ->
 
 
 def scan(
-    street: Street, pose: np.ndarray, rng: np.random.Generator, beams: int = 64, columns: int = 900, reach: float = 80.0,
-    noise: float = 0.02,
+    street: Street, pose: np.ndarray, rng: np.random.Generator, beams: int = 64, columns: int = 900,
+    reach: float = 80.0, noise: float = 0.02,
 ) -> np.ndarray:  # fmt: skip
     """(N, 3) points in the sensor's frame, of a spinning scanner that sees everything at one instant."""
     tangent = np.tan(np.radians(np.linspace(-24.8, 2.0, beams)))  # height gained over horizontal distance
@@ -106,7 +106,7 @@ def scan(
 def keep_nearest(
     distance: np.ndarray, hit: np.ndarray, enter: np.ndarray, leave: np.ndarray, top: float, tangent: np.ndarray
 ) -> None:
-    """Shorten ``distance`` (columns, beams) where a thing of height ``top`` over the eye is hit: its side, or its roof."""
+    """Shorten ``distance`` (columns, beams) where a thing is hit, its side or its roof at ``top`` over the eye."""
     side = np.where(enter[:, None] * tangent <= top, enter[:, None], np.inf)
     roof = top / tangent
     roof = np.where((tangent < 0) & (roof > enter[:, None]) & (roof < leave[:, None]), roof, np.inf)

@@ -13,10 +13,10 @@ import time
 
 import numpy as np
 import pytest
+from simulation import drive, make_street, scan
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
 from fmr_cli.io import read_poses
-from simulation import drive, make_street, scan
 
 FRAMES = 8
 
