@@ -33,10 +33,10 @@ RIDGE = 3e-3
 
 def scans(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, bool]:
     """Two scans, and whether they belong together; in the scene's frame where they do."""
-    source, target = scan_pair(rng)
+    source, target = full_pair(rng)
     kind = rng.choice(["views", "halves", "strangers"], p=[0.5, 0.2, 0.3])
     if kind == "strangers":
-        source, _ = scan_pair(rng)
+        source, _ = full_pair(rng)
     if kind == "halves":
         if rng.random() < 0.3:  # sheets, reliefs
             target = target * np.where(np.arange(3) == rng.integers(3), rng.uniform(0.01, 0.3), 1.0)
@@ -47,6 +47,14 @@ def scans(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, bool]:
     if rng.random() < 0.4:  # what moved, grew or was not there: up to a third of a scan is the scan's own
         source, target = clutter(source, rng), clutter(target, rng)
     return source, target, kind != "strangers"
+
+
+def full_pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Two scans of one scene, neither of which has missed it."""
+    while True:
+        source, target = scan_pair(rng)
+        if min(len(source), len(target)) >= 2000:
+            return source, target
 
 
 def clutter(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -64,8 +72,6 @@ def poses(seed: tuple[int, int]) -> list[tuple[np.ndarray, bool]]:
     """The evidence at each candidate pose of one fresh pair, and whether the pose is right."""
     rng = np.random.default_rng(seed)
     source, target, together = scans(rng)
-    if min(len(source), len(target)) < 500:
-        return []
     move = np.eye(4)
     move[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     try:
