@@ -14,7 +14,7 @@ from fmr_cli.cloud import transform_points
 REACH = 1.5  # a point's plane is sought within
 FLAT = 0.8  # length of the mean normal, below which a voxel holds no plane
 AGREE = 0.7  # cosine between the normals of a point and of its plane
-ROUNDS, STEPS = 3, 2  # of looking up planes, and of solving in between
+ROUNDS, STEPS = 2, 2  # of looking up planes, and of solving in between
 KERNEL = 3.0  # residuals beyond so many sigma weigh little (Geman-McClure)
 MIN_SIGMA = 0.01
 MIN_SPREAD = 0.3  # of log range, to tell how residuals grow with it
@@ -70,14 +70,17 @@ class PlaneMap:
             if on.sum() < 6 * BANDS:
                 return T, float("nan"), float("nan")
             p, n, offset, b = points[on], self.normals[plane[on]], self.means[plane[on]], band[on]
-            for _ in range(STEPS):
+            for again in range(STEPS):
                 moved = transform_points(T, p)
                 r = np.einsum("ij,ij->i", n, moved - offset)
-                sigma = scale_by_band(np.abs(r), b)
-                weight = trust(sigma, slope)[b] / (1 + (r / (KERNEL * sigma[b])) ** 2) ** 2
-                J = np.concatenate([np.cross(moved, n), n], 1)
-                H = np.einsum("ni,nj->ij", J, J * weight[:, None])
-                step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -(weight * r) @ J)
+                if not again:
+                    sigma = scale_by_band(np.abs(r), b)
+                    worth, kernel = trust(sigma, slope)[b], 1 / (KERNEL * sigma[b])
+                weight = worth / (1 + (r * kernel) ** 2) ** 2
+                x, y, z = moved.T
+                J = np.stack([y * n[:, 2] - z * n[:, 1], z * n[:, 0] - x * n[:, 2], x * n[:, 1] - y * n[:, 0], *n.T])
+                H = (J * weight) @ J.T
+                step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -J @ (weight * r))
                 T = exponential(step) @ T
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
