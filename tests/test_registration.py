@@ -139,7 +139,7 @@ def test_the_same_bits_in_threads_that_share_a_cloud(
     found: Registration, turned: tuple[Prepared, Prepared], room_scans: Scans
 ) -> None:
     target = prepare(PointCloud(room_scans[1]))
-    sources = [prepare(PointCloud(before(ANY, room_scans[0]))) for _ in range(2)]
+    sources = [prepare(PointCloud(before(ANY, room_scans[0])))]
     with ThreadPoolExecutor(4) as pool:
         results = list(pool.map(lambda s: align(s, target), [*sources, turned[0]]))
     assert all(same(r, found) for r in results)
@@ -157,8 +157,9 @@ def test_scans_of_different_places_are_uncertain(room_scans: Scans) -> None:
     rng = np.random.default_rng(70)
     other = scenes.room_scan(scenes.room(rng), rng, np.array([0.0, 0.0, 1.5]), 2.0, views=3)
     thing = scenes.thing_scan(scenes.thing(rng), rng, np.array([1.0, 0.5, 0.3]), 3) * 4  # of the room's size
-    for points in (other, thing):
-        assert align(PointCloud(rng.permutation(points)[:12_000]), PointCloud(room_scans[1])).status == "uncertain"
+    for points, init in ((other, "auto"), (thing, "features")):
+        some = PointCloud(rng.permutation(points)[:6_000])
+        assert align(some, PointCloud(room_scans[1][::2]), Options(init=init)).status == "uncertain"  # type: ignore[arg-type]
 
 
 def test_a_wrong_pose_that_is_given_is_not_called_aligned(turned: tuple[Prepared, Prepared]) -> None:
@@ -244,7 +245,7 @@ def test_one_scale_factor(room_scans: Scans) -> None:
     truth = ANY.copy()
     truth[:3, :3] *= 1 / 0.9
     source = before(truth, room_scans[0])
-    here = align(PointCloud(source), PointCloud(room_scans[1]), Options(scale=True))
+    here = align(PointCloud(source), PointCloud(room_scans[1]), Options(scale=True, init="features"))
     assert here.scale == pytest.approx(1 / 0.9, rel=3e-3)
     assert off(here, truth, source)[1] < 0.06
     assert here.status == "aligned"
@@ -253,7 +254,7 @@ def test_one_scale_factor(room_scans: Scans) -> None:
 def test_what_the_user_knows_bounds_the_search(level: tuple[Prepared, Prepared]) -> None:
     free = align(*level, Options(init="features"))
     assert free.angle == pytest.approx(140, abs=0.2)
-    bound = align(*level, Options(max_angle=90))
+    bound = align(*level, Options(max_angle=90, init="features"))
     assert bound.angle <= 90
     assert bound.status == "uncertain"
     assert align(*level, Options(init="features", max_angle=141, max_shift=free.shift + 0.1)).status == "aligned"
@@ -282,7 +283,8 @@ def test_whole_clouds_may_start_from_their_centroids(room_scans: Scans) -> None:
 
 @pytest.mark.parametrize("init", ["centroid", "given", "search"])
 def test_a_planar_motion_keeps_the_height_from_any_start(level: tuple[Prepared, Prepared], init: str) -> None:
-    here = align(*level, Options(dof="planar", init=LEVEL @ pose((9, 0, 0), (0, 0, 1)) if init == "given" else init))  # type: ignore[arg-type]
+    start = LEVEL @ pose((9.0, 0.0, 0.0), (0.0, 0.0, 1.0)) if init == "given" else init  # which leaves the plane
+    here = align(*level, Options(dof="planar", init=start, points=300))  # type: ignore[arg-type]
     np.testing.assert_allclose(here.T_target_source[2], [0, 0, 1, 0], rtol=0, atol=1e-12)
 
 

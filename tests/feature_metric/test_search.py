@@ -19,7 +19,7 @@ def turned(bodies: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Per shape: source, target, drawn apart, and the rotation between them, from anywhere in SO(3)."""
     found = []
     for i, T in enumerate(rotations(300)[[11, 97]].float()):
-        found.append((se3.transform(T.mT, bodies[i : i + 1, 512:]), bodies[i : i + 1, :512], T))
+        found.append((se3.transform(T.mT, bodies[i : i + 1, 512:896]), bodies[i : i + 1, :384], T))
     return found
 
 
@@ -54,8 +54,8 @@ def test_the_same_poses_every_run(
 def test_a_search_about_the_vertical_keeps_it(encoder: Encoder, bodies: Tensor) -> None:
     motion = Motion("yaw")
     T = motion.starts(0)[11].float()  # 165 deg
-    source = se3.transform(T.mT, bodies[:1, 512:])
-    found = search(encoder, source, bodies[:1, :512], motion.starts(0), basis=motion.basis())
+    source = se3.transform(T.mT, bodies[:1, 512:896])
+    found = search(encoder, source, bodies[:1, :384], motion.starts(0), basis=motion.basis())
     up = torch.tensor([0.0, 0.0, 1.0])
     assert (found.g[:, :3, :3] @ up - up).abs().max() < 1e-6
     assert math.degrees(rotation_between(found.g[0, :3, :3], T[:3, :3])) < 3
