@@ -169,6 +169,9 @@ def sequence_command(
     voxel_size: Annotated[
         float | None, typer.Option(help="The working voxel edge. [default: by the data]", min=0.0)
     ] = None,
+    loop_closure: Annotated[
+        bool, typer.Option("--loop-closure", help="Close loops in --out; the path before goes to NAME.odometry.*.")
+    ] = False,
     truth: Annotated[
         Path | None, typer.Option(help="True poses, KITTI rows: errors beside --out as .evaluation.json and .png.")
     ] = None,
@@ -193,7 +196,7 @@ def sequence_command(
         true = trajectory_eval.read_truth(truth, found.chosen, found.total)
     sequence = Sequence(
         found, out, form=form, camera_frame=camera_frame, residuals=residuals, merged=merged,
-        merged_voxel=merged_voxel or None, voxel_size=voxel_size or None,
+        merged_voxel=merged_voxel or None, voxel_size=voxel_size or None, loop_closure=loop_closure,
     )  # fmt: skip
     done = sequence.open(resume)
     with live(err, done, len(found.files), err.is_terminal and not quiet) as show:

@@ -25,7 +25,9 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
 from fmr_cli.io import read_cloud, write_cloud
 from fmr_cli.io.files import atomic_write, check_readable, reason
+from fmr_cli.loop_closure import check_installed, close_loops
 from fmr_cli.odometry import Frame, Odometry, Scan, choose_voxel
+from fmr_cli.outputs import write_json
 from fmr_cli.scans import Scans
 from fmr_cli.voxel_map import GrowingMap
 
@@ -52,7 +54,8 @@ class Sequence:
     """One run over the scans of a sequence.
 
     out: the poses. residuals: a CSV row a frame. merged: the map, of voxels of ``merged_voxel`` (half the working
-    voxel where None). camera_frame: poses of the camera that ``calib.txt`` tells of. voxel_size: the working voxel,
+    voxel where None). loop_closure: at the end, close the loops in ``out``, and keep the path as it was followed
+    in ``odometry_out``. camera_frame: poses of the camera that ``calib.txt`` tells of. voxel_size: the working voxel,
     file units, or None: taken from the first scan.
     Raises FmrError where the options ask for what the sequence does not have.
     """
@@ -60,13 +63,18 @@ class Sequence:
     def __init__(
         self, scans: Scans, out: Path, *, form: Format = "kitti", camera_frame: bool = False,
         residuals: Path | None = None, merged: Path | None = None, merged_voxel: float | None = None,
-        voxel_size: float | None = None,
+        voxel_size: float | None = None, loop_closure: bool = False,
     ) -> None:  # fmt: skip
         if camera_frame and scans.T_camera_scan is None:
             raise FmrError(f"{scans.files[0].parent}: no calib.txt with a line Tr, leave out --camera-frame")
         self.scans, self.out, self.form, self.residuals = scans, out, form, residuals
         self.T_camera_scan = scans.T_camera_scan if camera_frame else None
         self.merged, self.merged_voxel, self.voxel_size = merged, merged_voxel, voxel_size
+        self.odometry_out = out.with_name(f"{out.stem}.odometry{out.suffix}")
+        self.loop_closure = loop_closure
+        self.loops = 0
+        if loop_closure:
+            check_installed()
         self.journal = out.with_name(out.name + ".journal")
         self.rows: list[dict[str, Any]] = []
         self.poses: list[np.ndarray] = []  # this frame to the first, file units
@@ -94,7 +102,7 @@ class Sequence:
         with atomic_write(self.journal) as part:
             part.write_text("".join(json.dumps(record) + "\n" for record in [settings, *lines]), "utf-8")
         for index, row in enumerate(self.rows):
-            if self.map and row["status"] == "aligned":
+            if self.map and row["status"] == "aligned" and not self.loop_closure:
                 self.map.add(read_cloud(self.scans.files[index]), self.poses[index], index)
         return len(self.rows)
 
@@ -131,7 +139,7 @@ class Sequence:
         self.poses.append(frame.pose)
         self.rows.append(row)
         row |= self._described(frame, begin)
-        if self.map and frame.status == "aligned" and loaded.cloud is not None:
+        if self.map and frame.status == "aligned" and loaded.cloud is not None and not self.loop_closure:
             self.map.add(loaded.cloud, frame.pose, index)
         record = {
             "row": row, "size": loaded.size, "T": self.odometry.poses[-1].tolist(), "state": self.odometry.state(),
@@ -258,17 +266,35 @@ class Sequence:
         """(n, 4, 4): every frame's ``pose``."""
         return np.stack([self.pose(index) for index in range(len(self.poses))])
 
+    def _close_loops(self) -> None:
+        """Both paths into files, and the map again along the closed one."""
+        odometry = self.odometry
+        sure = np.array([row["status"] == "aligned" for row in self.rows])
+        inner = np.stack([odometry.to_voxels(pose) for pose in self.poses])
+        self._write_path(self.odometry_out)
+        closed, loops = close_loops(inner, sure, self._scan_again)
+        self.poses, self.loops = [odometry.to_file(T) for T in closed], len(loops)
+        self._write_path(self.out)
+        for index in np.flatnonzero(sure) if self.map else []:
+            assert self.map
+            self.map.add(read_cloud(self.scans.files[index]), self.poses[index], int(index))
+
+    def _write_path(self, path: Path) -> None:
+        if self.form != "json":
+            with atomic_write(path) as part:
+                part.write_text("".join(self._line(self.form, i) for i in range(len(self.rows))), "utf-8")
+            return
+        frames = [
+            {**row, "pose": self.pose(i).tolist()} | ({} if self.scans.times is None else {"time": self.scans.times[i]})
+            for i, row in enumerate(self.rows)
+        ]
+        write_json(path, {"version": fmr_cli.__version__, "frames": frames})
+
     def _finish(self) -> None:
-        if self.form == "json":
-            frames = [
-                {**row, "pose": self.pose(i).tolist()}
-                | ({} if self.scans.times is None else {"time": self.scans.times[i]})
-                for i, row in enumerate(self.rows)
-            ]
-            with atomic_write(self.out) as part:
-                part.write_text(
-                    json.dumps({"version": fmr_cli.__version__, "frames": frames}, indent=1) + "\n", "utf-8"
-                )
+        if self.loop_closure:
+            self._close_loops()
+        elif self.form == "json":
+            self._write_path(self.out)
         if self.map and self.merged:
             write_cloud(self.merged, self.map.cloud())
         self.journal.unlink(missing_ok=True)
@@ -278,6 +304,8 @@ class Sequence:
         length = sum(row["motion"] for row in self.rows)
         residuals = [row["inlier_rmse"] for row in self.rows[1:] if "inlier_rmse" in row]
         lines = [f"{len(self.rows)} frames, path length {length:.6g}, voxel {self.odometry.voxel:g}: {self.out}"]
+        if self.loop_closure:
+            lines.append(f"{self.loops} loops closed; the path before: {self.odometry_out}")
         if residuals:
             worst = max(self.rows[1:], key=lambda row: row.get("inlier_rmse", 0.0))
             lines.append(
