@@ -220,15 +220,17 @@ class Pair:
         poses = found.g.double().cpu().numpy()
         return [Start(self.restored(g), "search", e.tolist()) for g, e in zip(poses, found.errors.T, strict=True)]
 
-    @torch.inference_mode()
     def from_pose(self, T: np.ndarray, name: str) -> list[Start]:
-        """The allowed pose next to T, and where the IC solver of the paper goes from it."""
-        T = self.motion.exact(torch.from_numpy(T)).numpy()
-        g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
+        """The allowed pose next to T."""
+        return [Start(self.motion.exact(torch.from_numpy(T)).numpy(), name, [])]
+
+    @torch.inference_mode()
+    def from_solver(self, T: np.ndarray, name: str) -> list[Start]:
+        """Where the IC solver of the paper goes from the allowed pose next to T."""
+        g = torch.from_numpy(self.normalised(self.from_pose(T, name)[0].T)[None]).to(self.Q)
         template = make_template(self.encoder, self.P)
         found = solve(self.encoder, template, self.Q, g, self.iterations, self.robust, self.motion.basis())
-        solved = self.restored(found.g[0].double().cpu().numpy())
-        return [Start(T, name, found.errors[:1, 0].tolist()), Start(solved, name, found.errors[:, 0].tolist())]
+        return [Start(self.restored(found.g[0].double().cpu().numpy()), name, found.errors[:, 0].tolist())]
 
     # How a pose is refined and judged.
 

@@ -14,7 +14,8 @@ from fmr_cli.cloud import transform_points
 REACH = 1.5  # a point's plane is sought within
 FLAT = 0.8  # length of the mean normal, below which a voxel holds no plane
 AGREE = 0.7  # cosine between the normals of a point and of its plane
-ROUNDS, STEPS = 2, 2  # of looking up planes, and of solving in between
+ROUNDS, STEPS = 5, 2  # of looking up planes, at most, and of solving in between
+STILL = np.array([2e-4] * 3 + [1e-2] * 3)  # radians, voxels: a round that moves less is the last
 KERNEL = 3.0  # residuals beyond so many sigma weigh little (Geman-McClure)
 MIN_SIGMA = 0.01
 MIN_SPREAD = 0.3  # of log range, to tell how residuals grow with it
@@ -62,6 +63,7 @@ class PlaneMap:
         edges = np.quantile(ranges, np.linspace(0, 1, BANDS + 1)[1:-1])
         band = np.searchsorted(edges, ranges)
         middle = np.log(np.quantile(ranges, (np.arange(BANDS) + 0.5) / BANDS) + 1e-9)
+        first = np.zeros(6)
         for _ in range(ROUNDS):
             found, squared = self.tree.batch_nearest_neighbor_search(transform_points(T, points))
             plane = np.array(found)
@@ -73,7 +75,7 @@ class PlaneMap:
             for again in range(STEPS):
                 moved = transform_points(T, p)
                 r = np.einsum("ij,ij->i", n, moved - offset)
-                if not again:
+                if again == 0:
                     sigma = scale_by_band(np.abs(r), b)
                     worth, kernel = trust(sigma, slope)[b], 1 / (KERNEL * sigma[b])
                 weight = worth / (1 + (r * kernel) ** 2) ** 2
@@ -82,6 +84,9 @@ class PlaneMap:
                 H = (J * weight) @ J.T
                 step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -J @ (weight * r))
                 T = exponential(step) @ T
+                first = step if again == 0 else first
+            if (np.abs(first) < STILL).all():
+                break
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
         return T, float(np.sqrt((weight * r**2).sum() / weight.sum())), own

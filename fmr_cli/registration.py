@@ -172,10 +172,10 @@ def align(source: PointCloud | Prepared, target: PointCloud | Prepared, options:
         source = source if isinstance(source, Prepared) else prepare(source, options.seed)
         target = target if isinstance(target, Prepared) else prepare(target, options.seed)
     best: tuple[Pair, float, list[Candidate]] | None = None
-    for factor in scale_factors(source, target) if options.scale else (1.0,):
-        scaled = source if factor == 1.0 else source.scaled(factor)
+    for factor in scale_factors(source, target, options) if options.scale else (1.0,):
+        scaled, given = (source, options) if factor == 1.0 else (source.scaled(factor), unscaled(options, factor))
         pair = make_pair(scaled, target, options)
-        candidates = find(pair, options, seconds)
+        candidates = find(pair, given, seconds)
         if best is None or candidates[0].confidence > best[2][0].confidence:
             best = pair, factor, candidates
     assert best is not None
@@ -230,18 +230,16 @@ def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candid
 
 def start_makers(pair: Pair, options: Options) -> list[tuple[str, Callable[[], list[Start]]]]:
     """The kinds of start to try, in order: (stage, function)."""
-    if not isinstance(options.init, str):
-        given = local_pose(np.asarray(options.init, float), pair)
-        return [("solve", lambda: pair.from_pose(given, "given"))]
-    if options.init in ("identity", "centroid"):
-        name = options.init
-        here = local_pose(np.eye(4), pair) if name == "identity" else np.eye(4)
-        return [("solve", lambda: pair.from_pose(here, name))]
+    T, name = np.eye(4), options.init if isinstance(options.init, str) else "given"
+    if name in ("given", "identity"):
+        T = local_pose(np.eye(4) if name == "identity" else np.asarray(options.init, float), pair)
+    if name in ("given", "identity", "centroid"):  # as it is; where that does not fit, where the solver goes from it
+        return [("start", lambda: pair.from_pose(T, name)), ("solve", lambda: pair.from_solver(T, name))]
     makers: list[tuple[str, Callable[[], list[Start]]]] = [
         ("features", pair.from_features),
         ("search", pair.from_search),
     ]
-    return [maker for maker in makers if options.init in ("auto", maker[0])]
+    return [maker for maker in makers if name in ("auto", maker[0])]
 
 
 def local_pose(T: np.ndarray, pair: Pair) -> np.ndarray:
@@ -345,7 +343,18 @@ def angle_degrees(T: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(sine, np.trace(R) - 1)))
 
 
-def scale_factors(source: Prepared, target: Prepared) -> list[float]:
-    """Scales to try: about the ratio of the root mean square sizes, and about that of the surfaces' voxel edges."""
+def scale_factors(source: Prepared, target: Prepared, options: Options) -> list[float]:
+    """Scales to try: a given pose's own, or some about the ratio of the clouds' root mean square sizes."""
+    if not isinstance(options.init, str):
+        return [float(np.cbrt(np.linalg.det(np.asarray(options.init, float)[:3, :3])))]
     sizes = float(np.sqrt((target.points**2).sum(1).mean() / (source.points**2).sum(1).mean()))
     return [sizes * s for s in SCALES]
+
+
+def unscaled(options: Options, factor: float) -> Options:
+    """The options for a source that was multiplied by ``factor``: a given pose without it."""
+    if isinstance(options.init, str):
+        return options
+    rigid = np.array(options.init, float)
+    rigid[:3, :3] /= factor
+    return replace(options, init=rigid)

@@ -70,7 +70,7 @@ def fit(source: Surface, target: Surface, T: np.ndarray) -> dict[str, float]:
     }
 
 
-WEIGHTS = np.array([-13.0, 2.0, 3.0, 2.0, 1.0, 1.0, 1.0, 0.5, 0.0])
+WEIGHTS = np.array([-8.241, 0.647, 1.609, 1.078, 0.417, 0.385, 2.15, 1.946, 0.0])
 
 
 def confidence(evidence: Evidence) -> float:
