@@ -27,7 +27,7 @@ MIN_POINTS = 50  # of a thinned scan, below which it is not worth a try
 
 FINE, COARSE, WIDE = 1.0, 2.0, 8.0  # edges of the map's three levels
 REACH = 3.0  # correspondences are sought within so many voxels of a map
-KEYFRAME_MOTION = 10.0  # mean displacement of the points since the last keyframe ...
+KEYFRAME_MOTION = 8.0  # mean displacement of the points since the last keyframe ...
 KEYFRAME_RISE = 1.5  # ... or the fit so much worse than right after it: then the scan joins the map
 MAP_KEYFRAMES = 25  # the map is rebuilt from so many once it holds twice as many
 
