@@ -24,8 +24,8 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError, ModelError
 from fmr_cli.io import WRITABLE, read_cloud, write_cloud, write_transform
 from fmr_cli.io.files import check_readable, check_writable, reason
-from fmr_cli.outputs import aligned_cloud, merged_cloud, plain, write_json
-from fmr_cli.registration import Options, Prepared, align, prepare
+from fmr_cli.outputs import aligned_cloud, merged_cloud, write_json
+from fmr_cli.registration import Options, Prepared, align, plain, prepare
 
 COLUMNS = (
     "source", "target", "status", "seconds", "transform", "overlap", "inlier_rmse", "feature_error", "confidence",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -90,7 +89,7 @@ def metrics(source: PointCloud, target: PointCloud, found: Registration) -> dict
         role: {"file": cloud.name, "points": len(cloud), "dropped": cloud.dropped}
         for role, cloud in (("source", source), ("target", target))
     }
-    return plain({**files, **found.to_dict()})
+    return {**files, **found.to_dict()}
 
 
 def summary(source: PointCloud, target: PointCloud, found: Registration) -> list[str]:
@@ -108,19 +107,6 @@ def summary(source: PointCloud, target: PointCloud, found: Registration) -> list
         if cloud.dropped:
             lines.append(f"{cloud.name}: {cloud.dropped} points without finite coordinates are left out")
     return lines
-
-
-def plain(value: Any) -> Any:
-    """The value in JSON's types; what is not finite becomes None, since JSON has no word for it."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
 
 
 def write_json(path: Path, value: Any) -> None:

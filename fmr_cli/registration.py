@@ -115,22 +115,23 @@ class Registration:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON types, with the versions it was made by."""
-        said = {name: _plain(value) for name, value in vars(self).items() if name != "options"}
-        options = {name: _plain(value) for name, value in asdict(self.options).items()}
+        said = {name: plain(value) for name, value in vars(self).items() if name != "options"}
+        options = plain(asdict(self.options))
         said |= {"iterations": max(len(self.feature_errors) - 1, 0), "options": options, "versions": versions()}
         return said
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float) and not np.isfinite(value):
-        return None  # JSON has no infinity
+def plain(value: Any) -> Any:
+    """The value in JSON's types; what is not finite becomes None, since JSON has no word for it."""
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
 
 
 def versions() -> dict[str, str]:

@@ -9,7 +9,8 @@ import pytest
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.outputs import aligned_cloud, check_outputs, merged_cloud, plain, write_json
+from fmr_cli.outputs import aligned_cloud, check_outputs, merged_cloud, write_json
+from fmr_cli.registration import plain
 
 FAR = np.array([691_000.0, 5_335_000.0, 520.0])  # as UTM coordinates are
 T = np.array([[0.0, -1, 0, FAR[0]], [1, 0, 0, FAR[1]], [0, 0, 1, FAR[2]], [0, 0, 0, 1]])  # a quarter turn about z
