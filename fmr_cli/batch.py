@@ -12,6 +12,7 @@ from collections import OrderedDict, deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from io import StringIO
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -166,7 +167,7 @@ class Batch:
             return []
         if not settings.exists() or json.loads(settings.read_text("utf-8")) != self.settings():
             raise CloudFileError(f"{results}: was made with other settings (see {settings.name}), give another --out")
-        rows = list(csv.DictReader(whole.decode("utf-8").splitlines()))
+        rows = list(csv.DictReader(StringIO(whole.decode("utf-8"), newline="")))
         made_from = [(row.get("source"), row.get("target")) for row in rows]
         if not whole.startswith(head) or made_from != [(p.source, p.target) for p in self.pairs[: len(rows)]]:
             raise CloudFileError(f"{results}: was made from another manifest, give another --out")
