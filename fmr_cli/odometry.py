@@ -36,8 +36,8 @@ MAP_KEYFRAMES = 25  # the map is rebuilt from so many once it holds twice as man
 MIN_OVERLAP, MAX_COST = 0.35, 3.0
 OVERLAP_DROP = 0.5  # against the running median
 DOUBTFUL_OVERLAP, DOUBTFUL_TOTAL = 0.85, 1.25  # against the running medians: beyond, more starts are tried
-OUTLIER_COST = 2.0  # what a point without counterpart costs where two poses are compared
-CONVINCING = 1.4  # below such a total cost one start is enough; right poses have up to 1.3, wrong ones from 1.7
+OUTLIER_COST = 4.0  # what a point without counterpart costs where two poses are compared
+CONVINCING = 2.3  # below such a total cost one start is enough; right poses have up to 2.1, wrong ones from 2.9
 LOST_AFTER = 3  # so many uncertain frames in a row, and the map is begun anew at the prediction
 
 
@@ -230,14 +230,16 @@ class Odometry:
     def _best_fit(self, scan: Scan, predicted: np.ndarray) -> tuple[Fit, FeatureErrors]:
         """Trust the prediction while predictions have been good; else compare starts by what they come to."""
         expected = 3 * max(self.errors, default=np.inf)
+        fits = []
         if self.aligned > 2:
             fit = self.map.fit(scan, predicted, (FINE,) if expected < FINE else (COARSE, FINE), "prediction")
             if self._usual(fit) and displacement(fit.T, predicted, scan.points) < expected + COARSE:
                 return fit, None
+            fits = [fit]
         starts = {"prediction": predicted, "still": self.poses[-1]} if len(self.poses) > 1 else {"still": predicted}
-        fits = [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
+        fits += [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
         best = min(fits, key=lambda fit: fit.total)
-        agreed = len(fits) > 1 and displacement(fits[0].T, fits[1].T, scan.points) < FINE / 2
+        agreed = len(fits) > 1 and all(displacement(fit.T, best.T, scan.points) < FINE / 2 for fit in fits)
         if self._fits(best) and (agreed or best.total < CONVINCING):
             return best, None
         T, feature_errors = self._feature_start(scan)
