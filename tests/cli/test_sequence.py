@@ -16,7 +16,7 @@ import pytest
 from simulation import drive, make_street, scan
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
-from fmr_cli.io import read_poses
+from fmr_cli.io import read_poses, write_poses
 
 FRAMES = 8
 
@@ -173,3 +173,25 @@ def test_killed_and_resumed_it_comes_to_the_same_poses(fmr_here, street, tmp_pat
     assert fmr_here("sequence", folder, "--out", out, "--residuals", residuals, "--resume").returncode == 0
     assert np.abs(read_poses(out) - read_poses(tmp_path / "whole.txt")).max() < 1e-9
     assert [row["frame"] for row in table(residuals)] == [str(i) for i in range(FRAMES)]
+
+
+def test_errors_against_the_truth_and_a_plot(fmr_here, street, tmp_path):
+    pytest.importorskip("evo")
+    folder, truth = street
+    write_poses(tmp_path / "truth.txt", truth)
+    done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", "--truth", tmp_path / "truth.txt", "--step", 2)
+    assert done.returncode == 0, done.stderr
+    errors = json.loads((tmp_path / "p.evaluation.json").read_text())
+    assert errors["frames"] == FRAMES // 2
+    assert errors["ate_rmse"] < 0.03
+    assert "end drift" in done.stderr
+    assert (tmp_path / "p.png").stat().st_size > 1000
+
+
+def test_a_truth_of_another_length_is_one_line(fmr_here, street, tmp_path):
+    pytest.importorskip("evo")
+    write_poses(tmp_path / "truth.txt", street[1][:3])
+    done = fmr_here("sequence", street[0], "--out", tmp_path / "p.txt", "--truth", tmp_path / "truth.txt")
+    assert done.returncode == 2
+    assert f"3 poses for {FRAMES} scans" in done.stderr
+    assert not (tmp_path / "p.txt").exists()
