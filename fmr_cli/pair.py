@@ -23,7 +23,7 @@ from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder,
 from fmr_cli.feature_metric.motion import Motion, rotations
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.feature_metric.search import STARTS, search
-from fmr_cli.feature_metric.solver import make_template, solve
+from fmr_cli.feature_metric.solver import Template, make_template, solve
 from fmr_cli.preprocess import Surface, distinct, sample, voxel_downsample, working_scale
 
 MIN_POINTS = 10
@@ -168,6 +168,12 @@ class Pair:
             for x, c in zip((self.s, self.t), self.origins, strict=True)
         )
 
+    @cached_property
+    def template(self) -> Template:
+        """The global feature of the target, and its Jacobian."""
+        with torch.inference_mode():
+            return make_template(self.encoder, self.P)
+
     # Between the local frames and the encoder's: x -> (x - origin) / length.
 
     def normalised(self, T: np.ndarray) -> np.ndarray:
@@ -228,8 +234,7 @@ class Pair:
     def from_solver(self, T: np.ndarray, name: str) -> list[Start]:
         """Where the IC solver of the paper goes from the allowed pose next to T."""
         g = torch.from_numpy(self.normalised(self.from_pose(T, name)[0].T)[None]).to(self.Q)
-        template = make_template(self.encoder, self.P)
-        found = solve(self.encoder, template, self.Q, g, self.iterations, self.robust, self.motion.basis())
+        found = solve(self.encoder, self.template, self.Q, g, self.iterations, self.robust, self.motion.basis())
         return [Start(self.restored(found.g[0].double().cpu().numpy()), name, found.errors[:, 0].tolist())]
 
     # How a pose is refined and judged.
@@ -272,7 +277,7 @@ class Pair:
     def judged(self, T: np.ndarray, start: Start, patches: float) -> Candidate:
         """A pose with the evidence gathered at it; patches: the median patch error there."""
         votes, coincidence = self.votes(T), self.coincidence(T)
-        rivals = [(v, c) for pose, v, c in self.agreed if not self.same(T, pose)]
+        rivals = [(v, c) for pose, v, c in self.agreed + self.chance if not self.same(T, pose)]
         fit = verdict.fit(self.s, self.t, T)
         return Candidate(
             T,
@@ -282,8 +287,8 @@ class Pair:
                 **fit,
                 patches=patches if np.isfinite(patches) else 1.0,
                 votes=votes,
-                votes_over_rival=(votes + 1) / (max((v for v, _ in rivals), default=0) + 1),
-                fit_over_rival=coincidence / max(max((c for _, c in rivals), default=coincidence), 1e-3),
+                votes_over_rival=(votes + 1) / (max(v for v, _ in rivals) + 1),
+                fit_over_rival=coincidence / max(max(c for _, c in rivals), 1e-3),
                 contrast=self.chance_error / max(self.feature_error(T), 1e-9),
             ),
         )
@@ -295,12 +300,15 @@ class Pair:
         return bool(angle < DISTINCT_DEGREES and np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge)
 
     @cached_property
+    def chance(self) -> list[tuple[np.ndarray, int, float]]:
+        """Poses as good as random, rotations about the means, each with its votes and its coincidence."""
+        poses = [self.restored(g) for g in rotations(CHANCE_POSES).numpy()]
+        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in poses]
+
+    @cached_property
     def chance_error(self) -> float:
-        """The median of the global feature's error over a few rotations that are as good as random."""
-        g = rotations(CHANCE_POSES).to(self.Q)
-        with torch.inference_mode():
-            template = make_template(self.encoder, self.P)
-            return float(solve(self.encoder, template, self.Q.expand(len(g), -1, -1), g, 0).error.median())
+        """The median of the global feature's error at those."""
+        return float(np.median([self.feature_error(pose) for pose, _, _ in self.chance]))
 
     def candidate(self, start: Start, polished: bool, scale: bool) -> Candidate:
         """A start, refined patch by patch, polished where asked, and judged."""
@@ -343,7 +351,7 @@ class Pair:
     def feature_error(self, T: np.ndarray) -> float:
         """Mean |F(T Q) - F(P)| of the global feature at a pose."""
         g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
-        return float(solve(self.encoder, make_template(self.encoder, self.P), self.Q, g, 0).error)
+        return float(solve(self.encoder, self.template, self.Q, g, 0).error)
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fmr_cli.feature_metric.motion import Motion, rotation_between
 
-SEEDS, NEIGHBOURS = 60, 20
+SEEDS, NEIGHBOURS = 40, 20
 ROUNDS = 4  # of refitting a pose to its inliers
 APART = 0.26  # rad: poses nearer than this and within two tolerances are one
 
@@ -34,12 +34,14 @@ def consensus(source: Tensor, target: Tensor, tolerance: float, count: int, moti
     gap = (torch.cdist(source, source) - torch.cdist(target, target)).abs()
     agree = (gap < tolerance).float()
     second = agree * (agree @ agree)
-    seeds = torch.argsort(-second.sum(1), stable=True)[:SEEDS]
-    weight, members = second[seeds].topk(min(NEIGHBOURS, len(source)), dim=1)
-    T = motion.fit(source[members], target[members], weight)
-    for _ in range(ROUNDS):
-        error = residuals(T, source, target)
-        T = motion.fit(source.expand(len(T), -1, -1), target.expand(len(T), -1, -1), (error < tolerance).float() + 1e-9)
+    first = poses_from_seeds(second, source, target, tolerance, motion)
+    # Again without the matches of the best pose, so that there is always another one to compare it with.
+    best = residuals(first, source, target).lt(tolerance).sum(1).argmax()
+    left = residuals(first[best : best + 1], source, target)[0] >= tolerance
+    T = first
+    if int(left.sum()) >= 3:
+        others = poses_from_seeds(second[left][:, left], source[left], target[left], tolerance, motion)
+        T = torch.cat([first, others])
     inliers = (residuals(T, source, target) < tolerance).sum(1).float()
     kept: list[int] = []
     centre = source.mean(0)
@@ -53,6 +55,17 @@ def consensus(source: Tensor, target: Tensor, tolerance: float, count: int, moti
         if len(kept) == count:
             break
     return T[kept], inliers[kept]
+
+
+def poses_from_seeds(second: Tensor, source: Tensor, target: Tensor, tolerance: float, motion: Motion) -> Tensor:
+    """A pose for each of the matches that most others agree with, fitted to its inliers: second (C, C) -> (S, 4, 4)."""
+    seeds = torch.argsort(-second.sum(1), stable=True)[:SEEDS]
+    weight, members = second[seeds].topk(min(NEIGHBOURS, len(source)), dim=1)
+    T = motion.fit(source[members], target[members], weight)
+    for _ in range(ROUNDS):
+        error = residuals(T, source, target)
+        T = motion.fit(source.expand(len(T), -1, -1), target.expand(len(T), -1, -1), (error < tolerance).float() + 1e-9)
+    return T
 
 
 def residuals(T: Tensor, source: Tensor, target: Tensor) -> Tensor:
