@@ -29,7 +29,7 @@ FINE, COARSE, WIDE = 1.0, 2.0, 8.0  # edges of the map's three levels
 REACH = 3.0  # correspondences are sought within so many voxels of a map
 KEYFRAME_MOTION = 8.0  # mean displacement of the points since the last keyframe ...
 KEYFRAME_RISE = 1.5  # ... or the fit so much worse than right after it: then the scan joins the map
-MAP_KEYFRAMES = 25  # the map is rebuilt from so many once it holds twice as many
+MAP_KEYFRAMES = 20  # the map is rebuilt from so many once it holds twice as many
 
 # A scan that fits has 0.7 to 0.95 of its points on the map at a mean cost of 0.3 to 0.7 (squared distance to the
 # local planes over their variance, halved), whatever the sensor.
