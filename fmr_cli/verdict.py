@@ -70,7 +70,7 @@ def fit(source: Surface, target: Surface, T: np.ndarray) -> dict[str, float]:
     }
 
 
-WEIGHTS = np.array([-8.241, 0.647, 1.609, 1.078, 0.417, 0.385, 2.15, 1.946, 0.0])
+WEIGHTS = np.array([-5.613, 0.0, 3.203, 0.558, 1.469, 1.699, 1.892, 1.175, 0.0])
 
 
 def confidence(evidence: Evidence) -> float:
