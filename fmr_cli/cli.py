@@ -172,6 +172,9 @@ def sequence_command(
     loop_closure: Annotated[
         bool, typer.Option("--loop-closure", help="Close loops in --out; the path before goes to NAME.odometry.*.")
     ] = False,
+    deskew: Annotated[
+        bool, typer.Option("--deskew", help="Undo the motion within each scan, by the times of its points.")
+    ] = False,
     truth: Annotated[
         Path | None, typer.Option(help="True poses, KITTI rows: errors beside --out as .evaluation.json and .png.")
     ] = None,
@@ -197,6 +200,7 @@ def sequence_command(
     sequence = Sequence(
         found, out, form=form, camera_frame=camera_frame, residuals=residuals, merged=merged,
         merged_voxel=merged_voxel or None, voxel_size=voxel_size or None, loop_closure=loop_closure,
+        deskew=deskew,
     )  # fmt: skip
     done = sequence.open(resume)
     with live(err, done, len(found.files), err.is_terminal and not quiet) as show:

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
@@ -22,6 +22,7 @@ import numpy as np
 
 import fmr_cli
 from fmr_cli.cloud import PointCloud
+from fmr_cli.deskew import deskew, scan_times
 from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
 from fmr_cli.io import read_cloud, write_cloud
 from fmr_cli.io.files import atomic_write, check_readable, reason
@@ -42,7 +43,10 @@ COLUMNS = (
 
 @dataclass
 class Loaded:
-    """A scan as it came from its file: thinned, or None with a message that says why it cannot be used."""
+    """A scan as it came from its file: thinned, or None with a message that says why it cannot be used.
+
+    cloud: as read, where it is needed after that.
+    """
 
     scan: Scan | None
     cloud: PointCloud | None
@@ -56,14 +60,15 @@ class Sequence:
     out: the poses. residuals: a CSV row a frame. merged: the map, of voxels of ``merged_voxel`` (half the working
     voxel where None). loop_closure: at the end, close the loops in ``out``, and keep the path as it was followed
     in ``odometry_out``. camera_frame: poses of the camera that ``calib.txt`` tells of. voxel_size: the working voxel,
-    file units, or None: taken from the first scan.
+    file units, or None: taken from the first scan. deskew: undo the motion within each scan, by the times of its
+    points; its pose is then that of the middle of the scan.
     Raises FmrError where the options ask for what the sequence does not have.
     """
 
     def __init__(
         self, scans: Scans, out: Path, *, form: Format = "kitti", camera_frame: bool = False,
         residuals: Path | None = None, merged: Path | None = None, merged_voxel: float | None = None,
-        voxel_size: float | None = None, loop_closure: bool = False,
+        voxel_size: float | None = None, loop_closure: bool = False, deskew: bool = False,
     ) -> None:  # fmt: skip
         if camera_frame and scans.T_camera_scan is None:
             raise FmrError(f"{scans.files[0].parent}: no calib.txt with a line Tr, leave out --camera-frame")
@@ -71,7 +76,7 @@ class Sequence:
         self.T_camera_scan = scans.T_camera_scan if camera_frame else None
         self.merged, self.merged_voxel, self.voxel_size = merged, merged_voxel, voxel_size
         self.odometry_out = out.with_name(f"{out.stem}.odometry{out.suffix}")
-        self.loop_closure = loop_closure
+        self.loop_closure, self.deskew = loop_closure, deskew
         self.loops = 0
         if loop_closure:
             check_installed()
@@ -86,6 +91,7 @@ class Sequence:
         if records:
             header, *lines = records
             self.odometry = Odometry(header["voxel"], np.array(header["origin"]))
+            self.start = np.array(header["start"])
             poses = [np.array(line["T"]) for line in lines]
             self.rows = [line["row"] for line in lines]
             self.poses = [self.odometry.to_file(T) for T in poses]
@@ -96,14 +102,17 @@ class Sequence:
             first = self._read_first()
             voxel = self.voxel_size or choose_voxel(first)
             self.odometry = Odometry(voxel, np.median(first, axis=0))
+            self.start = self._first_motion() if self.deskew else np.eye(4)
             lines = []
-        settings = self._settings() | {"voxel": self.odometry.voxel, "origin": self.odometry.origin.tolist()}
+        settings = self._settings() | {
+            "voxel": self.odometry.voxel, "origin": self.odometry.origin.tolist(), "start": self.start.tolist(),
+        }  # fmt: skip
         self.map = GrowingMap(self.merged_voxel or self.odometry.voxel / 2) if self.merged else None
         with atomic_write(self.journal) as part:
             part.write_text("".join(json.dumps(record) + "\n" for record in [settings, *lines]), "utf-8")
         for index, row in enumerate(self.rows):
             if self.map and row["status"] == "aligned" and not self.loop_closure:
-                self.map.add(read_cloud(self.scans.files[index]), self.poses[index], index)
+                self.map.add(self._whole(index), self.poses[index], index)
         return len(self.rows)
 
     def run(self) -> Iterator[dict[str, Any]]:
@@ -131,6 +140,9 @@ class Sequence:
     def _step(self, index: int, loaded: Loaded, journal: TextIO) -> dict[str, Any]:
         begin = time.perf_counter()
         row = loaded.row
+        if self.deskew:
+            self._thin(loaded, index)
+            begin = time.perf_counter()
         scan = None if self._odd(loaded, row) else loaded.scan
         try:
             frame = self.odometry.register(scan)
@@ -176,34 +188,76 @@ class Sequence:
         return said
 
     def _load(self, index: int) -> Loaded:
-        """Read and thin one scan; runs beside the registration of the one before."""
+        """Read one scan, and thin it where no motion is to be undone; runs beside the registration of others."""
         path = self.scans.files[index]
-        row: dict[str, Any] = {"frame": index, "file": path.name, "points": 0}
+        loaded = Loaded(None, None, 0.0, {"frame": index, "file": path.name, "points": 0})
         begin = time.perf_counter()
         try:
-            cloud = read_cloud(path, attributes=bool(self.merged))
+            loaded.cloud = read_cloud(path, attributes=bool(self.merged) or self.deskew)
         except CloudFileError as error:
-            return Loaded(None, None, 0.0, row | {"message": str(error)})
-        row["points"], row["read_s"] = len(cloud), round(time.perf_counter() - begin, 4)
+            loaded.row["message"] = str(error)
+            return loaded
+        loaded.row |= {"points": len(loaded.cloud), "read_s": round(time.perf_counter() - begin, 4)}
+        if not self.deskew:
+            self._thin(loaded, index)
+        return loaded
+
+    def _thin(self, loaded: Loaded, index: int) -> None:
+        """Make a scan that was read ready to register; with ``deskew`` the frames before it must be known."""
+        if loaded.cloud is None:
+            return
         begin = time.perf_counter()
-        scan = self.odometry.prepare(cloud.points)
-        if scan is None:
-            row["message"] = f"{path}: only {len(cloud)} points, too few to register"
-        size = float(np.abs(scan.points).mean()) if scan else 0.0
-        row["prepare_s"] = round(time.perf_counter() - begin, 4)
-        return Loaded(scan, cloud if self.merged else None, size, row)
+        try:
+            cloud = self._deskewed(loaded.cloud, index)
+        except CloudFileError as error:
+            loaded.cloud, loaded.row["message"] = None, str(error)
+            return
+        loaded.scan = self.odometry.prepare(cloud.points)
+        if loaded.scan is None:
+            loaded.row["message"] = f"{cloud.name}: only {len(cloud)} points, too few to register"
+        else:
+            loaded.size = float(np.abs(loaded.scan.points).mean())
+        loaded.cloud = cloud if self.merged else None
+        loaded.row["prepare_s"] = round(time.perf_counter() - begin, 4)
+
+    def _deskewed(self, cloud: PointCloud, index: int) -> PointCloud:
+        """With ``deskew``, a scan without the motion within: that between the two frames before it."""
+        if not self.deskew:
+            return cloud
+        times = scan_times(cloud)
+        motion = np.linalg.inv(self.poses[index - 2]) @ self.poses[index - 1] if index > 1 else self.start
+        return replace(cloud, points=deskew(cloud.points, times, motion))
 
     def _scan_again(self, index: int) -> Scan:
-        scan = self._load(index).scan
-        if scan is None:
+        loaded = self._load(index)
+        if self.deskew:
+            self._thin(loaded, index)
+        if loaded.scan is None:
             raise FmrError(f"{self.scans.files[index]}: cannot be read again, it has changed; leave out --resume")
-        return scan
+        return loaded.scan
+
+    def _whole(self, index: int) -> PointCloud:
+        """A frame's scan with all its attributes, for the map."""
+        return self._deskewed(read_cloud(self.scans.files[index]), index)
 
     def _read_first(self) -> np.ndarray:
         try:
-            return read_cloud(self.scans.files[0], attributes=False).points
+            cloud = read_cloud(self.scans.files[0], attributes=self.deskew)
         except CloudFileError as error:
             raise CloudFileError(f"{error}; or leave this first scan out with --start") from None
+        if self.deskew:
+            scan_times(cloud)  # says before anything is written that points have no times
+        return cloud.points
+
+    def _first_motion(self) -> np.ndarray:
+        """(4, 4), file units: the second frame to the first by their scans as they are, which are skewed alike."""
+        odometry = Odometry(self.odometry.voxel, self.odometry.origin)
+        try:
+            scans = [odometry.prepare(read_cloud(path, attributes=False).points) for path in self.scans.files[:2]]
+            _, second = (odometry.register(scan) for scan in scans)
+        except (CloudFileError, RegistrationError):
+            return np.eye(4)  # the run itself says what is wrong with them
+        return second.pose if second.status == "aligned" else np.eye(4)
 
     def _settings(self) -> dict[str, Any]:
         """What must be the same in the run that is resumed."""
@@ -211,6 +265,7 @@ class Sequence:
             "version": fmr_cli.__version__,
             "files": [str(path) for path in self.scans.files],
             "voxel_size": self.voxel_size,
+            "deskew": self.deskew,
         }
 
     def _read_journal(self) -> list[dict[str, Any]]:
@@ -277,7 +332,7 @@ class Sequence:
         self._write_path(self.out)
         for index in np.flatnonzero(sure) if self.map else []:
             assert self.map
-            self.map.add(read_cloud(self.scans.files[index]), self.poses[index], int(index))
+            self.map.add(self._whole(int(index)), self.poses[index], int(index))
 
     def _write_path(self, path: Path) -> None:
         if self.form != "json":

@@ -77,12 +77,17 @@ def scan(
     street: Street, pose: np.ndarray, rng: np.random.Generator, beams: int = 64, columns: int = 900,
     reach: float = 80.0, noise: float = 0.02,
 ) -> np.ndarray:  # fmt: skip
-    """(N, 3) points in the sensor's frame, of a spinning scanner that sees everything at one instant."""
+    """(N, 3) points in the sensor's frame, of a spinning scanner.
+
+    pose: (4, 4), where it sees everything at one instant; or (columns, 4, 4), where it moves: each column, from
+    azimuth 0 to 360 degrees, is seen from its own pose and given in the frame of that pose.
+    """
     tangent = np.tan(np.radians(np.linspace(-24.8, 2.0, beams)))  # height gained over horizontal distance
     azimuth = np.arange(columns) * 2 * np.pi / columns
     rays = np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
-    world = rays @ pose[:2, :2].T
-    eye, height = pose[:2, 3], pose[2, 3]
+    poses = np.broadcast_to(pose, (columns, 4, 4))
+    world = np.einsum("cij,cj->ci", poses[:, :2, :2], rays)
+    eye, height = poses[:, :2, 3], poses[0, 2, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.tile(np.where(tangent < 0, -height / tangent, np.inf), (columns, 1))  # horizontal, to the ground
         for low, high in street.boxes:
@@ -92,8 +97,8 @@ def scan(
             keep_nearest(distance, hit, enter[hit], leave[hit], high[2] - height, tangent)
         for x, y, radius, top in street.poles:
             offset = eye - [x, y]
-            b = world @ offset
-            root = b**2 - (offset @ offset - radius**2)
+            b = (world * offset).sum(1)
+            root = b**2 - ((offset**2).sum(1) - radius**2)
             enter = -b - np.sqrt(root)
             hit = (root > 0) & (enter > 0) & (enter < reach)
             keep_nearest(distance, hit, enter[hit], -b[hit] + np.sqrt(root[hit]), top - height, tangent)

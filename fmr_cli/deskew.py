@@ -1,0 +1,47 @@
+"""A scanner that moves while it scans sees each point from another place: undo that, where points have times."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import CloudFileError
+
+TIME_FIELDS = ("gps_time", "time", "timestamp", "t", "offset_time", "time_offset")
+
+
+def scan_times(cloud: PointCloud) -> np.ndarray:
+    """(N,) when each point was measured: 0 for the scan's first, 1 for its last, whatever unit the file has.
+
+    A point whose time is not finite gets the middle. Raises CloudFileError where no field tells times apart.
+    """
+    name = next((n for n in TIME_FIELDS if n in cloud.attributes and cloud.attributes[n].ndim == 1), None)
+    if name is None:
+        known = ", ".join(TIME_FIELDS)
+        raise CloudFileError(f"{cloud.name}: has no time per point (fields {known}), leave out --deskew")
+    values = cloud.attributes[name]
+    finite = np.isfinite(values)
+    # Subtracted in the file's type: nanoseconds since 1970 have more digits than float64.
+    since = (values - values[finite].min()).astype(np.float64) if finite.any() else np.zeros(len(values))
+    last = since[finite].max(initial=0.0)
+    if not last > 0:
+        raise CloudFileError(f"{cloud.name}: field {name} is the same for all points, leave out --deskew")
+    return np.where(finite, since / last, 0.5)
+
+
+def deskew(points: np.ndarray, times: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Points as the scanner would have seen them had it stood where it was in the middle of the scan.
+
+    points: (N, 3), file units, each in the sensor's frame of its own moment; times: (N,), 0 to 1 over the scan;
+    motion: (4, 4), the sensor's frame at 1 to that at 0. Returns (N, 3), file units, in the frame at 0.5.
+    With the motion's constant turn w and velocity v, and u = time - 0.5: x -> exp(u w) x + u v + u^2 / 2 w x v, where
+    v + w x v / 2 is the motion's shift (the arc to second order). The middle is also what the pose of an untouched
+    scan refers to on average.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    velocity = np.linalg.solve(np.eye(3) + np.cross(turn, np.eye(3)).T / 2, motion[:3, 3])
+    u = (times - 0.5)[:, None]
+    shift = u * velocity + u**2 / 2 * np.cross(turn, velocity)
+    return Rotation.from_rotvec(u * turn).apply(points) + shift
