@@ -51,7 +51,9 @@ class Scan:
     """
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray) -> None:
-        self.cloud, _ = small_gicp.preprocess_points(points, 1.0, NEIGHBOURS, 1)
+        # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
+        self.cloud = small_gicp.PointCloud(small_gicp.voxelgrid_sampling(points, 1.0).points())
+        small_gicp.estimate_normals_covariances(self.cloud, num_neighbors=NEIGHBOURS)
         self.points = self.cloud.points()[:, :3]
         self.normals = self.cloud.normals()[:, :3]
         rays = self.points - sensor
