@@ -21,10 +21,10 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.pair import Prepared
-from fmr_cli.registration import REFINED, Options, angle_degrees, local_pose, make_pair
+from fmr_cli.registration import REFINED, Options, local_pose, make_pair
 from fmr_cli.training.local import degrade, scan_pair
 
 RIGHT_DEGREES, RIGHT_EDGES = 5.0, 2.0

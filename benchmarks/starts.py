@@ -20,10 +20,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.io import read_cloud
 from fmr_cli.pair import Pair, Prepared, Start
-from fmr_cli.registration import Options, angle_degrees, local_pose, make_pair
+from fmr_cli.registration import Options, local_pose, make_pair
 from fmr_cli.training.local import scan_pair
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, target, T_target_source

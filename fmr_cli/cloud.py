@@ -88,3 +88,10 @@ class PointCloud:
 def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """R x + t for every row x of points (N, 3); T is 4x4, both float64."""
     return points @ T[:3, :3].T + T[:3, 3]
+
+
+def angle_degrees(T: np.ndarray) -> float:
+    """The rotation angle of T's (scaled) rotation, degrees."""
+    R = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
+    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.degrees(np.arctan2(sine, np.trace(R) - 1)))

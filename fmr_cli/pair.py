@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from fmr_cli import polish, verdict
-from fmr_cli.cloud import PointCloud
+from fmr_cli.cloud import PointCloud, angle_degrees
 from fmr_cli.errors import RegistrationError
 from fmr_cli.feature_metric.consensus import consensus, match
 from fmr_cli.feature_metric.encoder import Encoder
@@ -295,8 +295,7 @@ class Pair:
 
     def same(self, a: np.ndarray, b: np.ndarray) -> bool:
         """Whether two poses are one, but for what a refinement moves."""
-        D = np.linalg.inv(a) @ b
-        angle = np.degrees(np.arccos(np.clip((np.trace(D[:3, :3]) - 1) / 2, -1, 1)))
+        angle = angle_degrees(np.linalg.inv(a) @ b)
         return bool(angle < DISTINCT_DEGREES and np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge)
 
     @cached_property

@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 
 WORKING_VOXELS = 5000  # the voxel edge is chosen so that about so many are occupied
 SAMPLE = 15_000  # points that the choice of the voxel edge looks at
-HALF_EXTENT = 0.5  # of a normalised cloud, as the encoder was trained
 NORMAL_NEIGHBOURS = 16
 SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
 

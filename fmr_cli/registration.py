@@ -18,7 +18,7 @@ import torch
 
 import fmr_cli
 from fmr_cli import polish, verdict
-from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import FmrError
 from fmr_cli.feature_metric.motion import Dof, Motion
 from fmr_cli.pair import Candidate, Pair, Prepared, Start
@@ -335,13 +335,6 @@ def describe(
         options=options,
         warnings=warnings,
     )
-
-
-def angle_degrees(T: np.ndarray) -> float:
-    """The rotation angle of T's (scaled) rotation, degrees."""
-    R = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
-    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.degrees(np.arctan2(sine, np.trace(R) - 1)))
 
 
 def scale_factors(source: Prepared, target: Prepared, options: Options) -> list[float]:

@@ -21,7 +21,7 @@ from typing import Any, Literal, TextIO
 import numpy as np
 
 import fmr_cli
-from fmr_cli.cloud import PointCloud
+from fmr_cli.cloud import PointCloud, angle_degrees
 from fmr_cli.deskew import deskew, scan_times
 from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
 from fmr_cli.io import read_cloud, write_cloud
@@ -183,7 +183,7 @@ class Sequence:
                 float(f"{e:.6g}") for e in frame.feature_errors
             )
         said["motion"] = float(f"{np.linalg.norm(motion[:3, 3]):.6g}")
-        said["rotation_deg"] = float(f"{rotation_degrees(motion):.6g}")
+        said["rotation_deg"] = float(f"{angle_degrees(motion):.6g}")
         said["register_s"] = round(time.perf_counter() - begin, 4)
         return said
 
@@ -405,13 +405,6 @@ def csv_line(cells: list[Any]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(cells)
     return text.getvalue()
-
-
-def rotation_degrees(T: np.ndarray) -> float:
-    """The angle of a pose's rotation."""
-    R = T[:3, :3]
-    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.degrees(np.arctan2(sine, np.trace(R) - 1)))
 
 
 def quaternion(R: np.ndarray) -> np.ndarray:

@@ -16,9 +16,10 @@ import pytest
 from simulation import drive, make_street, scan
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
+from fmr_cli.cloud import angle_degrees
 from fmr_cli.io import read_poses, write_poses
 from fmr_cli.scans import find_scans
-from fmr_cli.sequence import Sequence, rotation_degrees
+from fmr_cli.sequence import Sequence
 
 FRAMES = 8
 MOVING = 14
@@ -222,7 +223,7 @@ def test_deskew_undoes_the_motion_within_the_scans(fmr_here, moving, tmp_path):
         done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", *options)
         assert done.returncode == 0, done.stderr
         error = np.linalg.inv(read_poses(tmp_path / "p.txt")) @ truth
-        end_errors.append([np.linalg.norm(error[-1, :3, 3]), rotation_degrees(error[-1])])
+        end_errors.append([np.linalg.norm(error[-1, :3, 3]), angle_degrees(error[-1])])
     (shift, angle), (shift_deskewed, angle_deskewed) = end_errors
     assert shift_deskewed < min(0.06, shift / 3)
     assert angle_deskewed < min(0.15, angle / 5)
