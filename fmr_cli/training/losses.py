@@ -17,7 +17,7 @@ from fmr_cli.feature_metric.encoder import Encoder, chain
 from fmr_cli.feature_metric.solver import SCALE_FROM, SCALE_TO, geman_mcclure
 
 DAMPING = 1e-4  # of the mean diagonal of JᵀWJ: keeps an early, badly determined step from blowing up the gradient
-CLIP = 1.0  # largest point error that still pulls, in units of the normalised cloud
+NEAR = 0.05  # point error, in units of the normalised cloud, from which on its logarithm counts
 
 
 @dataclass
@@ -49,7 +49,7 @@ def critical_index(encoder: Encoder, points: Tensor) -> Tensor:
             value = torch.nn.functional.linear(cloud, encoder.linear[-1].weight).float()
             value.view(torch.int32).bitwise_or_(number)
             found.append(value.amax(1).view(torch.int32) & 0xFFFF)
-    return torch.cat(found).long()
+    return torch.cat(found).long().clamp_max(points.shape[1] - 1)  # of a NaN, any: the loss says so
 
 
 def encode(encoder: Encoder, points: Tensor) -> Code:
@@ -86,8 +86,8 @@ def pose_loss(
 ) -> Tensor:
     """Point error of the unrolled IC: source, target (B, N, 3), truth T_target_source (B, 4, 4).
 
-    The mean distance of g Q to truth Q after each iteration, averaged over the iterations: a start far off is pulled
-    too, not only the last step.
+    The mean over pairs of log(1 + d / NEAR), d the RMS distance of g Q to truth Q, after each iteration; the i-th
+    counts i-fold. The logarithm lets a pair that is nearly right pull as much as one that is lost.
     """
     wanted = se3.transform(truth, source)
     aim = encode(encoder, target)
@@ -98,7 +98,7 @@ def pose_loss(
         moved = se3.transform(g, source)
         r = encode(encoder, moved).feature - aim.feature
         fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * iteration / max(iterations - 1, 1)
-        weight = geman_mcclure(r, fall).detach() if robust else torch.ones_like(r)
+        weight = geman_mcclure(r, fall) if robust else torch.ones_like(r)
         WJ = weight[..., None] * J
         A, b = J.mT @ WJ, WJ.mT @ r[..., None]
         damping = DAMPING * A.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * torch.eye(6, device=A.device)
@@ -106,5 +106,5 @@ def pose_loss(
         step = step / step.norm(dim=-1, keepdim=True).clamp_min(1.0)  # the solver's cap of one radian
         g = se3.exp(step) @ g
         distance = (se3.transform(g, source) - wanted).square().sum(-1).mean(-1).clamp_min(1e-12).sqrt()
-        loss = loss + distance.clamp_max(CLIP).mean() / iterations
-    return loss
+        loss = loss + (iteration + 1) * torch.log1p(distance / NEAR).mean()
+    return 2 * loss / (iterations * (iterations + 1))
