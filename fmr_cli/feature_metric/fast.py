@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -49,26 +48,6 @@ class Solution:
     def error(self) -> np.ndarray:
         """(S,) the last mean |r|."""
         return self.errors[-1]
-
-
-class Solver(Protocol):
-    """F and the solver on it: ``FastEncoder``, or ``solver.TorchSolver`` on a GPU."""
-
-    layers: Layers
-
-    def __call__(self, points: np.ndarray, /) -> np.ndarray: ...
-
-    def template(self, target: np.ndarray, /) -> Template: ...
-
-    def solve(
-        self,
-        template: Template,
-        source: np.ndarray,
-        g: np.ndarray,
-        iterations: int = 10,
-        robust: bool = True,
-        basis: np.ndarray | None = None,
-    ) -> Solution: ...
 
 
 class FastEncoder:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from fmr_cli.feature_metric.fast import Solver
+from fmr_cli.feature_metric.fast import Solution, Template
 from fmr_cli.feature_metric.motion import rotation_between
 
 # 64 rotations leave none further than 60.4 deg from a start (30 on average); the solver's basin, measured, reaches 60.
@@ -18,6 +19,24 @@ STARTS = 64
 COARSE_POINTS, COARSE_ITERATIONS = 256, 6
 KEPT, FINE_ITERATIONS = 6, 15
 APART = math.radians(10.0)  # poses nearer than this are one
+
+
+class Solver(Protocol):
+    """F and the solver on it: ``fast.FastEncoder``, or ``solver.OnDevice`` on a GPU."""
+
+    def __call__(self, points: np.ndarray, /) -> np.ndarray: ...
+
+    def template(self, target: np.ndarray, /) -> Template: ...
+
+    def solve(
+        self,
+        template: Template,
+        source: np.ndarray,
+        g: np.ndarray,
+        iterations: int = 10,
+        robust: bool = True,
+        basis: np.ndarray | None = None,
+    ) -> Solution: ...
 
 
 @dataclass

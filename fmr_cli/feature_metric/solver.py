@@ -131,12 +131,11 @@ def capped(step: Tensor, size: float) -> Tensor:
     return step * (size / step.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1.0)
 
 
-class TorchSolver:
-    """A ``fast.Solver``, numpy in and out, computed on the device of a torch encoder."""
+class OnDevice:
+    """A ``search.Solver``, numpy in and out, computed on the device of a torch encoder."""
 
     def __init__(self, encoder: Encoder) -> None:
         self.encoder, self.device = encoder, next(encoder.parameters()).device
-        self.layers = [(x.weight.cpu().numpy(), x.bias.cpu().numpy()) for x in encoder.linear]
 
     def tensor(self, x: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(x, np.float32)).to(self.device)

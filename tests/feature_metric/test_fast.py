@@ -13,7 +13,7 @@ from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
 from fmr_cli.feature_metric.fast import FastEncoder
 from fmr_cli.feature_metric.motion import Motion, exp
-from fmr_cli.feature_metric.solver import TorchSolver
+from fmr_cli.feature_metric.solver import OnDevice
 
 START = np.eye(4)[None]
 
@@ -61,7 +61,7 @@ def test_the_pose_of_the_plain_solver(
     fast: FastEncoder, encoder: Encoder, room: np.ndarray, kind: str, degrees: float, robust: bool
 ) -> None:
     source, target = pair(room, kind, degrees)
-    plain = TorchSolver(encoder)
+    plain = OnDevice(encoder)
     expected = plain.solve(plain.template(target), source, START, 10, robust)
     found = fast.solve(fast.template(target), source, START, 10, robust)
     np.testing.assert_allclose(found.g, expected.g, rtol=0, atol=2e-5)
@@ -70,7 +70,7 @@ def test_the_pose_of_the_plain_solver(
 
 
 def test_constrained_and_many_starts(fast: FastEncoder, encoder: Encoder, room: np.ndarray) -> None:
-    motion, plain = Motion("yaw"), TorchSolver(encoder)
+    motion, plain = Motion("yaw"), OnDevice(encoder)
     starts = motion.starts(0)[:5]
     target, source = room[:256], room[256:512]
     found = fast.solve(fast.template(target), source, starts, 6, True, motion.basis())

@@ -12,7 +12,7 @@ from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.fast import FastEncoder
 from fmr_cli.feature_metric.motion import Motion, rotation_between, rotations
 from fmr_cli.feature_metric.search import APART, KEPT, STARTS, Found, search
-from fmr_cli.feature_metric.solver import TorchSolver
+from fmr_cli.feature_metric.solver import OnDevice
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, target, T_target_source
 
@@ -59,7 +59,7 @@ def test_the_same_poses_every_run(fast: FastEncoder, turned: list[Problem], resu
 
 def test_torch_finds_the_same_pose(encoder: Encoder, turned: list[Problem], results: list[Found]) -> None:
     source, target, _ = turned[0]
-    found = search(TorchSolver(encoder), source, target, rotations(STARTS))
+    found = search(OnDevice(encoder), source, target, rotations(STARTS))
     np.testing.assert_allclose(found.g[0], results[0].g[0], rtol=0, atol=1e-3)
 
 
