@@ -16,7 +16,7 @@ from fmr_cli.preprocess import Surface, normals_and_variation
 
 ITERATIONS = 30
 COVARIANCE_NEIGHBOURS = 10
-WEAK = 1e-3  # of the strongest direction's information
+WEAK = 2e-3  # of the strongest direction's information: what the noise of the normals alone pretends to
 
 
 class GicpCloud:

@@ -13,6 +13,8 @@ from scipy.spatial import cKDTree
 
 WORKING_VOXELS = 5000  # the voxel edge is chosen so that about so many are occupied
 SAMPLE = 15_000  # points that the choice of the voxel edge looks at
+SPACING_SAMPLE = 1_000  # of them, whose nearest neighbour is looked up
+SCALE_ROUNDS = 5
 NORMAL_NEIGHBOURS = 16
 SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
 
@@ -26,7 +28,8 @@ def voxel_downsample(points: np.ndarray, edge: float) -> np.ndarray:
 
 def occupied_voxels(points: np.ndarray, edge: float) -> int:
     """How many voxels of the given edge hold a point."""
-    return len(np.unique(cell_numbers(points, edge)))
+    cells = np.sort(cell_numbers(points, edge))
+    return 1 + int(np.count_nonzero(cells[1:] != cells[:-1]))
 
 
 def cell_numbers(points: np.ndarray, edge: float) -> np.ndarray:
@@ -55,13 +58,13 @@ def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, 
     point, rescaled from a sample as on a surface.
     """
     some = sample(points, SAMPLE, rng)
-    nearest = cKDTree(some).query(sample(some, 2000, rng), 2)[0][:, 1]
+    tree = cKDTree(some, balanced_tree=False, compact_nodes=False)
+    nearest = tree.query(sample(some, SPACING_SAMPLE, rng), 2)[0][:, 1]
     spacing = float(np.median(nearest)) * np.sqrt(len(some) / max(len(points), len(some)))
-    low, high = spacing / 4, float(np.ptp(some, axis=0).max())
-    for _ in range(10):
-        middle = np.sqrt(low * high)
-        low, high = (middle, high) if occupied_voxels(some, middle) > WORKING_VOXELS else (low, middle)
-    return high, spacing
+    edge, least = spacing * np.sqrt(len(some) / WORKING_VOXELS), spacing / 4
+    for _ in range(SCALE_ROUNDS):  # on a surface the count falls with the edge's square
+        edge = max(edge * np.sqrt(occupied_voxels(some, edge) / WORKING_VOXELS), least)
+    return edge, spacing
 
 
 def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -73,7 +76,7 @@ def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray
     distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
     neighbours = points[index]
     centred = neighbours - neighbours.mean(1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
+    values, vectors = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)
     return vectors[:, :, 0], values[:, 0] / np.maximum(values.sum(1), 1e-300), distance[:, -1]
 
 
@@ -109,13 +112,21 @@ class Surface:
 
         radius: in voxel edges. Offsets are in radii, nearest first; what a row lacks of ``neighbours`` is not valid.
         """
-        centres = self.points[index]
-        found = self.tree.query(centres, min(neighbours, len(self.points)), distance_upper_bound=radius * self.edge)[1]
-        valid = found < len(self.points)
-        found = np.where(valid, found, index[:, None])
+        offsets, valid, found = self.around(self.points[index], radius * self.edge, neighbours)
+        normals = self.normals.astype(np.float32)
         return {
-            "offsets": ((self.points[found] - centres[:, None]) / (radius * self.edge)).astype(np.float32),
-            "valid": valid.astype(np.float32),
-            "normal": self.normals[index].astype(np.float32),
-            "neighbour_normals": self.normals[found].astype(np.float32),
-        }
+            "offsets": offsets, "valid": valid, "normal": normals[index], "neighbours": found, "normals": normals,
+        }  # fmt: skip
+
+    def around(self, centres: np.ndarray, radius: float, neighbours: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The at most ``neighbours`` nearest points within ``radius`` of centres (K, 3), own unit, nearest first.
+
+        Their offsets from the centre in radii (K, n, 3) and which of them are there (K, n), float32; their rows (K, n),
+        0 where they are not.
+        """
+        found = self.tree.query(centres, min(neighbours, len(self.points)), distance_upper_bound=radius)[1]
+        valid = (found < len(self.points)).astype(np.float32)
+        found[found == len(self.points)] = 0
+        offsets = ((self.points[found] - centres[:, None]) / radius).astype(np.float32)
+        offsets *= valid[..., None]
+        return offsets, valid, found

@@ -13,7 +13,7 @@ import numpy as np
 from fmr_cli.preprocess import Surface
 
 ALIGNED = 0.5  # confidence from which a pose is called aligned
-TOUCHING, NEAR, AROUND = 1.5, 0.8, 2.4  # voxel edges
+TOUCHING = 1.5  # voxel edges
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,7 @@ class Evidence:
     """What speaks for a pose.
 
     overlap: share of the smaller scan within TOUCHING of the other one. inlier_rmse: of those, own unit.
-    near: of the points within AROUND of the other scan, the share within NEAR: surfaces that coincide, not just cross.
     normals: mean |cosine| between the normals of touching points.
-    patches: median patch residual at the pose over the patches' mean feature norm; 1 where none is co-occupied.
     votes: how many matches of local features agree with the pose, whether or not it came from them.
     votes_over_rival, fit_over_rival: the votes (plus one) and the share of the source that coincides with the target,
         each over the most that another pose has, which matches agree on but which was rejected.
@@ -32,9 +30,7 @@ class Evidence:
 
     overlap: float
     inlier_rmse: float
-    near: float
     normals: float
-    patches: float
     votes: int
     votes_over_rival: float
     fit_over_rival: float
@@ -42,36 +38,32 @@ class Evidence:
 
     def vector(self) -> np.ndarray:
         """What the logistic model sees, after a 1 for the intercept: of each kind of evidence, more is better."""
-        ratios = [self.overlap, self.votes_over_rival, self.fit_over_rival, self.contrast, 1 / max(self.patches, 1e-3)]
-        return np.array([1.0, self.near, self.normals, np.log1p(self.votes), *np.log(np.clip(ratios, 1e-2, 1e2))])
+        ratios = [self.overlap, self.votes_over_rival, self.fit_over_rival, self.contrast]
+        return np.array([1.0, self.normals, np.log1p(self.votes), *np.log(np.clip(ratios, 1e-2, 1e2))])
 
 
 def fit(source: Surface, target: Surface, T: np.ndarray) -> dict[str, float]:
     """How the surfaces fit at T (4x4, source to target, in their frames), both on the same voxel edge.
 
-    Returns the ``Evidence`` that geometry gives: overlap, inlier_rmse, near, normals.
+    Returns the ``Evidence`` that geometry gives: overlap, inlier_rmse, normals.
     """
-    edge = target.edge
+    reach = TOUCHING * target.edge
     moved = source.points @ T[:3, :3].T + T[:3, 3]
     back = (target.points - T[:3, 3]) @ np.linalg.inv(T[:3, :3]).T
-    forth_d, forth_i = target.tree.query(moved, distance_upper_bound=AROUND * edge)
-    back_d = source.tree.query(back, distance_upper_bound=AROUND * edge)[0]
-    touching = np.concatenate([forth_d, back_d])
-    touching = touching[touching < TOUCHING * edge]
-    around = np.isfinite(forth_d).sum() + np.isfinite(back_d).sum()
-    near = (forth_d < NEAR * edge).sum() + (back_d < NEAR * edge).sum()
-    here = np.flatnonzero(forth_d < TOUCHING * edge)
+    forth_d, forth_i = target.tree.query(moved, distance_upper_bound=reach)
+    back_d = source.tree.query(back, distance_upper_bound=reach)[0]
+    here, touching = np.isfinite(forth_d), np.concatenate([forth_d, back_d])
+    touching = touching[np.isfinite(touching)]
     cosine = np.einsum("ni,ni->n", source.normals[here] @ T[:3, :3].T, target.normals[forth_i[here]])
     return {
-        "overlap": float(max(np.mean(forth_d < TOUCHING * edge), np.mean(back_d < TOUCHING * edge))),
+        "overlap": float(max(here.mean(), np.isfinite(back_d).mean())),
         "inlier_rmse": float(np.sqrt(np.mean(touching**2))) if len(touching) else float("inf"),
-        "near": float(near / max(around, 1)),
-        "normals": float(np.abs(cosine).mean()) if len(here) else 0.0,
+        "normals": float(np.abs(cosine).mean()) if here.any() else 0.0,
     }
 
 
 # `python -m benchmarks.calibrate --pairs 130 --seed 41000`
-WEIGHTS = np.array([-5.613, 0.0, 3.203, 0.558, 1.469, 1.699, 1.892, 1.175, 0.0])
+WEIGHTS = np.array([-5.613, 3.203, 0.558, 1.469, 1.699, 1.892, 1.175])
 
 
 def confidence(evidence: Evidence) -> float:

@@ -103,7 +103,8 @@ def test_patches_hold_neighbours_within_the_radius_nearest_first(scan: np.ndarra
     index = surface.keypoints(20)
     patches = surface.patches(index, 4.0, 100)
     assert {k: v.shape for k, v in patches.items()} == {
-        "offsets": (20, 100, 3), "valid": (20, 100), "normal": (20, 3), "neighbour_normals": (20, 100, 3),
+        "offsets": (20, 100, 3), "valid": (20, 100), "normal": (20, 3), "neighbours": (20, 100),
+        "normals": (len(surface.points), 3),
     }  # fmt: skip
     length = np.linalg.norm(patches["offsets"], axis=2)
     assert (length[patches["valid"] == 1] <= 1).all()
