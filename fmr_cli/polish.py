@@ -36,7 +36,7 @@ def gicp(source: GicpCloud, target: GicpCloud, T: np.ndarray, edge: float) -> np
 
     g = T.copy()
     g[:3, 3] /= edge
-    for reach, iterations, epsilon in ((2.0, 10, 1e-3), (1.0, ITERATIONS, 1e-6)):
+    for reach, iterations, epsilon in ((2.0, 10, 1e-2), (1.0, 10, 1e-4)):
         g = small_gicp.align(
             target.cloud, source.cloud, target.tree, g, registration_type="GICP", max_correspondence_distance=reach,
             max_iterations=iterations, rotation_epsilon=epsilon / 10, translation_epsilon=epsilon,

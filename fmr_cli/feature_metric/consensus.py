@@ -7,7 +7,6 @@ with another one counts the matches that agree with both: chance agreement hardl
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from fmr_cli.feature_metric.motion import Motion, rotation_between
 
@@ -33,15 +32,15 @@ def consensus(
     """
     if len(source) < 3:
         return np.zeros((0, 4, 4)), np.zeros(0, int)
-    agree = (np.abs(cdist(source, source) - cdist(target, target)) < tolerance).astype(np.float32)
-    second = agree * (agree @ agree)
-    T = poses_from_seeds(second, source, target, tolerance, motion)
+    agree = (np.abs(distances(source) - distances(target)) < tolerance).astype(np.float32)
+    second = agree @ agree
+    second *= agree
+    T = poses_from_seeds(second, source, target, tolerance, motion, np.ones(len(source), np.float32))
     # Again without the matches of the best pose, so that there is always another one to compare it with.
     near = residuals(T, source, target) < tolerance
-    left = ~near[near.sum(1).argmax()]
+    left = (~near[near.sum(1).argmax()]).astype(np.float32)
     if left.sum() >= 3:
-        others = poses_from_seeds(second[np.ix_(left, left)], source[left], target[left], tolerance, motion)
-        T = np.concatenate([T, others])
+        T = np.concatenate([T, poses_from_seeds(second, source, target, tolerance, motion, left)])
     inliers = (residuals(T, source, target) < tolerance).sum(1)
     kept: list[int] = []
     moved = T[:, :3, :3] @ source.mean(0) + T[:, :3, 3]
@@ -55,18 +54,33 @@ def consensus(
 
 
 def poses_from_seeds(
-    second: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, motion: Motion
+    second: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, motion: Motion, use: np.ndarray
 ) -> np.ndarray:
-    """A pose for each of the matches that most others agree with, fitted to its inliers: second (C, C) -> (S, 4, 4)."""
-    seeds = np.argsort(-second.sum(1), kind="stable")[:SEEDS]
-    members = np.argsort(-second[seeds], axis=1, kind="stable")[:, :NEIGHBOURS]
-    T = motion.fit(source[members], target[members], np.take_along_axis(second[seeds], members, 1).astype(float))
+    """A pose for each of the matches that most others agree with, fitted to its inliers: second (C, C) -> (S, 4, 4).
+
+    use: (C,), 0 for matches that do not count.
+    """
+    seeds = np.argsort(-(second @ use) * use, kind="stable")[: min(SEEDS, int(use.sum()))]
+    weight = second[seeds] * use
+    members = np.argpartition(-weight, min(NEIGHBOURS, len(source)) - 1, axis=1)[:, :NEIGHBOURS]
+    T = motion.fit(source[members], target[members], np.take_along_axis(weight, members, 1).astype(float))
     for _ in range(ROUNDS):
         near = residuals(T, source, target) < tolerance
-        T = motion.fit(source[None], target[None], near + 1e-9)
+        T = motion.fit(source[None], target[None], (near + 1e-9) * use)
     return T
 
 
 def residuals(T: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """|R s + t - q| of every match under every pose: T (B, 4, 4), (C, 3), (C, 3) -> (B, C)."""
-    return np.linalg.norm(source @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3] - target, axis=-1)
+    off = T[:, :3, :3] @ source.T + (T[:, :3, 3:] - target.T)  # [B x 3 x C]
+    return np.sqrt((off * off).sum(1))
+
+
+def distances(points: np.ndarray) -> np.ndarray:
+    """Between all points: (C, 3) -> (C, C) float32; float32 is exact enough for what is about their mean."""
+    x = points.astype(np.float32)
+    squared = (x * x).sum(1)
+    d2 = (-2 * x) @ x.T
+    d2 += squared
+    d2 += squared[:, None]
+    return np.sqrt(np.maximum(d2, 0, out=d2), out=d2)

@@ -74,10 +74,11 @@ class Motion:
 
     def fit(self, source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """The weighted least squares motions: source, target (B or 1, n, 3), weight (B, n) -> (B, 4, 4)."""
-        weight = (weight / np.maximum(weight.sum(-1, keepdims=True), 1e-12))[:, None]
+        weight = (weight / np.maximum(weight.sum(-1, keepdims=True), 1e-12))[:, None]  # [B x 1 x n]
         a, b = weight @ source, weight @ target  # [B x 1 x 3]
+        products = (target[..., :, None] * source[..., None, :]).reshape(*source.shape[:2], 9)
         T = np.tile(np.eye(4), (len(weight), 1, 1))
-        T[:, :3, :3] = self.rotation(np.swapaxes(target - b, 1, 2) @ (np.swapaxes(weight, 1, 2) * (source - a)))
+        T[:, :3, :3] = self.rotation((weight @ products).reshape(-1, 3, 3) - np.swapaxes(b, 1, 2) * a)
         shift = (b - a @ np.swapaxes(T[:, :3, :3], 1, 2))[:, 0]
         if self.dof == "planar":
             shift = shift + (self.lift - shift @ self.up)[:, None] * self.up
