@@ -17,6 +17,7 @@ SPACING_SAMPLE = 1_000  # of them, whose nearest neighbour is looked up
 SCALE_ROUNDS = 5
 NORMAL_NEIGHBOURS = 16
 CLOSE = 1e-2  # of the squared spread of eigenvalues: the closed form's rounding then shows in the eigenvector
+BORDER = 1e-3  # surface variation that a lean of 1 counts as
 SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
 
 
@@ -68,19 +69,23 @@ def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, 
     return edge, spacing
 
 
-def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined, surface variation (M,), and reach (M,).
+def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined; surface variation, reach, lean (M,) each.
 
     The surface variation is the smallest eigenvalue of the neighbourhood's covariance over their sum (Pauly 2002), 0 on
-    a plane, 1/3 where it is round; the reach is the distance to the last of the 16.
+    a plane, 1/3 where it is round; the reach is the distance to the last of the 16; the lean, how far off their mean is
+    as a share of it: most at a border.
     """
     distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
-    x, y, z = (c[index] for c in np.ascontiguousarray(points.T))
-    for c in (x, y, z):
-        c -= c.mean(1, keepdims=True)
+    x, y, z = (c[index] - c[:, None] for c in np.ascontiguousarray(points.T))
+    means = [c.mean(1, keepdims=True) for c in (x, y, z)]
+    for c, mean in zip((x, y, z), means, strict=True):
+        c -= mean
     products = [np.einsum("ij,ij->i", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
     normals, least = smallest_eigenvector(*products)
-    return normals, least / np.maximum(sum(products[:3]), 1e-300), distance[:, -1]
+    reach = np.maximum(distance[:, -1], 1e-300)
+    lean = np.linalg.norm(np.hstack(means), axis=1) / reach
+    return normals, least / np.maximum(sum(products[:3]), 1e-300), reach, lean
 
 
 def smallest_eigenvector(
@@ -127,7 +132,7 @@ class Surface:
         self.tree = cKDTree(self.points)
 
     @cached_property
-    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return normals_and_variation(self.points, self.tree)
 
     @property
@@ -138,10 +143,11 @@ class Surface:
     def keypoints(self, count: int) -> np.ndarray:
         """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.
 
-        Where neighbours are far, as in a LiDAR's outskirts, variation is chance: such points come last.
+        Where neighbours are far, as in a LiDAR's outskirts, variation is chance: such points come last. What is flat
+        has its keypoints on its outline.
         """
-        _, variation, reach = self._shape
-        order = np.argsort(-np.where(reach < SPARSE * self.edge, variation, 0.0), kind="stable")
+        _, variation, reach, lean = self._shape
+        order = np.argsort(-np.where(reach < SPARSE * self.edge, variation + BORDER * lean, 0.0), kind="stable")
         first = np.unique(cell_numbers(self.points[order], 2 * self.edge), return_index=True)[1]
         return order[np.sort(first)[:count]]
 

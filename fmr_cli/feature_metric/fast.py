@@ -5,6 +5,9 @@ Same equations, same schedule, same answer; arrays are numpy's.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +23,16 @@ MAX_STEP = 1.0  # rad, and units of the normalised cloud
 SCALE_FROM, SCALE_TO = 12.0, 0.7  # the robust scale's factor over the iterations, times the mean |r|
 STOP_STEP = 1e-7  # the float32 noise floor of a normalised cloud's feature
 RANK_TOLERANCE = 1e-9  # of the largest eigenvalue of JᵀJ
-CHUNK = 1024  # points; their K x CHUNK activation
+CHUNK = 512  # points; their activation of CHUNK x K stays in cache
+ROUNDING = 1e-6  # of a feature
+# Of a large source, first a few points; then those that do better in some channel; at the end all.
+LARGE, FEW = 4096, 1024
+NEAR = 0.02  # rad, and units of the normalised cloud: a step that leaves most channels to the points that have them
+LAST = 5  # iterations, at least, with all points that matter
+MISSED = 1e-3  # of the mean |r|: what the channels may gain by points left out
+MORE = 2  # iterations where they gain more
+
+Run = Callable[[Callable, Iterable], Iterable]
 
 
 @dataclass
@@ -50,45 +62,104 @@ class Solution:
         return self.errors[-1]
 
 
+@contextmanager
+def spread(threads: int) -> Iterator[Run]:
+    """A ``map`` over that many threads."""
+    if threads == 1:
+        yield map
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield pool.map
+
+
+def jobs(starts: int, count: int) -> list[tuple[int, slice]]:
+    """(start, part of the points) for each start and each part, always the same whatever the number of threads."""
+    return [(start, slice(i, i + CHUNK)) for start in range(starts) for i in range(0, count, CHUNK)]
+
+
+def few(points: np.ndarray) -> np.ndarray:
+    """About FEW of the points, evenly from their order."""
+    return points[:: max(len(points) // FEW, 1)]
+
+
 class FastEncoder:
-    """F and the solver on it, for one cloud on the CPU."""
+    """F and the solver on it, for one cloud on the CPU.
+
+    threads: how many of Python's to spread the work over, each with BLAS on one thread; it changes no bit of a result.
+    """
 
     def __init__(self, layers: Layers) -> None:
         self.layers = layers
+        self._transposed = [np.ascontiguousarray(W.T) for W, _ in layers]
 
     @classmethod
     def load(cls, path: Path | str) -> FastEncoder:
         """The encoder of a .safetensors file. Raises ModelError where it is missing or does not fit."""
         return cls(read_weights(path).layers)
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
+    def __call__(self, points: np.ndarray, threads: int = 1) -> np.ndarray:
         """F: (N, 3) -> (K,)."""
-        return self.encode(points)[0]
+        with spread(threads) as run:
+            return self.features(points, np.eye(4)[None], run)[0]
 
-    def pointwise(self, points: np.ndarray) -> np.ndarray:
-        """f of every point: (N, 3) -> (K, N), points along the contiguous axis."""
-        x = points.T.astype(np.float32)
-        for W, b in self.layers[:-1]:
-            x = W @ x
-            x += b[:, None]
-            np.maximum(x, 0, out=x)
-        W, b = self.layers[-1]
-        return W @ x + b[:, None]
-
-    def encode(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def encode(self, points: np.ndarray, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """F and the critical points: (N, 3) -> feature (K,), index (K,) of the point that set each channel."""
-        features, indices = [], []
-        for first in range(0, len(points), CHUNK):
-            values = self.pointwise(points[first : first + CHUNK])
-            where = values.argmax(1)
-            features.append(values[np.arange(len(values)), where])
-            indices.append(where + first)
-        best = np.argmax(features, 0)[None]
-        return np.take_along_axis(np.array(features), best, 0)[0], np.take_along_axis(np.array(indices), best, 0)[0]
+        points, here = points.astype(np.float32), self.posed(np.eye(4))
+        with spread(threads) as run:
+            index = self.contenders(points, np.eye(4), self.features(few(points), np.eye(4)[None], run)[0], run)[1]
+        values = self.values(points[index], here)
+        where = values.argmax(0)
+        return values[where, np.arange(len(where))] + here[-1][1], index[where]
 
-    def template(self, target: np.ndarray) -> Template:
+    def posed(self, g: np.ndarray) -> Layers:
+        """The layers, transposed, for points moved by g (4, 4), with biases that ``values`` may add late.
+
+        relu(z + b) = max(z, -b) + b, and the b goes through the next layer's matrix into its bias: one pass over an
+        activation in place of two, and none to move the points.
+        """
+        W, b = self.layers[0]
+        shift = W @ g[:3, 3] + b
+        layers = [((W @ g[:3, :3]).T.astype(np.float32), shift.astype(np.float32))]
+        for (W, b), transposed in zip(self.layers[1:], self._transposed[1:], strict=True):
+            shift = W @ shift + b
+            layers.append((transposed, shift.astype(np.float32)))
+        return layers
+
+    def values(self, points: np.ndarray, layers: Layers) -> np.ndarray:
+        """f of every point but for the last bias: (n, 3) float32, ``posed`` layers -> (n, K)."""
+        x = points
+        for W, b in layers[:-1]:
+            x = x @ W
+            np.maximum(x, -b, out=x)
+        return x @ layers[-1][0]
+
+    def features(self, points: np.ndarray, g: np.ndarray, run: Run) -> np.ndarray:
+        """F of the points (N, 3) float32 moved by each g (S, 4, 4): (S, K)."""
+        posed = [self.posed(T) for T in g]
+        parts = list(run(lambda job: self.values(points[job[1]], posed[job[0]]).max(0), jobs(len(g), len(points))))
+        best = np.array(parts).reshape(len(g), -1, len(self.layers[-1][1])).max(1)
+        return best + np.array([layers[-1][1] for layers in posed])
+
+    def contenders(
+        self, points: np.ndarray, g: np.ndarray, floor: np.ndarray, run: Run
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """F of points (N, 3) moved by g, and the indices of those that reach ``floor`` (K,) in some channel.
+
+        Where the floor is F of some of the points, they are all that F depends on.
+        """
+        layers = self.posed(g)
+        floor = floor - layers[-1][1] - ROUNDING
+
+        def part(job: tuple[int, slice]) -> tuple[np.ndarray, np.ndarray]:
+            values = self.values(points[job[1]], layers)
+            return values.max(0), (values >= floor).any(1)
+
+        best, reached = zip(*run(part, jobs(1, len(points))), strict=True)
+        return np.max(best, 0) + layers[-1][1], np.flatnonzero(np.concatenate(reached))
+
+    def template(self, target: np.ndarray, threads: int = 1) -> Template:
         """F(P) and its exact Jacobian, from the critical points: target (N, 3)."""
-        feature, index = self.encode(target)
+        feature, index = self.encode(target, threads)
         J = self.jacobian(target, index).astype(np.float64)
         eigenvalues = np.linalg.eigvalsh(J.T @ J)
         return Template(feature, J, int((eigenvalues > RANK_TOLERANCE * max(eigenvalues[-1], 1e-30)).sum()))
@@ -112,29 +183,61 @@ class FastEncoder:
         iterations: int = 10,
         robust: bool = True,
         basis: np.ndarray | None = None,
+        threads: int = 1,
     ) -> Solution:
         """Iterate from each g (S, 4, 4) on source (N, 3).
 
         basis: (6, d) orthonormal twists that the motion may use; None for all six. Stops early once no step of any
-        start exceeds ``STOP_STEP``.
+        start exceeds ``STOP_STEP``. From one start, of a large source: see ``solve_large``.
         """
-        errors = []
-        g = g.astype(np.float64)
-        for iteration in range(iterations):
-            r = self.residuals(template, source, g)
-            errors.append(np.abs(r).mean(-1))
-            fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * iteration / max(iterations - 1, 1)
-            weight = geman_mcclure(r, fall) if robust else np.ones_like(r)
-            step = weighted_step(template.J, weight, r, basis)
-            g = exp(step) @ g
-            if np.abs(step).max() < STOP_STEP:
-                break
-        errors.append(np.abs(self.residuals(template, source, g)).mean(-1))
+        source, g = source.astype(np.float32), g.astype(np.float64)
+        with spread(threads) as run:
+            if len(g) == 1 and len(source) >= LARGE:
+                return self.solve_large(template, source, g, iterations, robust, basis, run)
+            errors = []
+            for iteration in range(iterations):
+                r = self.features(source, g, run) - template.feature
+                errors.append(np.abs(r).mean(-1))
+                step = robust_step(template.J, r, iteration / max(iterations - 1, 1) if robust else None, basis)
+                g = exp(step) @ g
+                if np.abs(step).max() < STOP_STEP:
+                    break
+            errors.append(np.abs(self.features(source, g, run) - template.feature).mean(-1))
         return Solution(g, np.array(errors), template.rank)
 
-    def residuals(self, template: Template, source: np.ndarray, g: np.ndarray) -> np.ndarray:
-        """F(g Q) - F(P): (S, K)."""
-        return np.array([self(source @ T[:3, :3].T + T[:3, 3]) - template.feature for T in g])
+    def solve_large(
+        self,
+        template: Template,
+        source: np.ndarray,
+        g: np.ndarray,
+        iterations: int,
+        robust: bool,
+        basis: np.ndarray | None,
+        run: Run,
+    ) -> Solution:
+        """``solve`` from one start, evaluating only points that can win a channel.
+
+        At first these are few, spread over the source; once a step is small, those of all points that do better than
+        the few in some channel. Whether they were all is seen at the end, at the pose found: if not, it goes on with
+        those that were missed, until no step exceeds ``SETTLED``.
+        """
+        active, errors, near, iteration, end, size = few(source), [], False, 0, iterations, np.inf
+        while True:
+            feature = self.features(active, g, run)[0]
+            finished = iteration >= end or size < STOP_STEP
+            if finished or (not near and (size < NEAR or iteration >= iterations - LAST)):
+                whole, index = self.contenders(source, g[0], feature, run)
+                missed = np.mean(whole - feature)
+                active, feature, near = source[index], whole, True
+            r = feature - template.feature
+            errors.append(np.abs(r).mean())
+            if finished:
+                if missed <= MISSED * errors[-1] or end > iterations:
+                    return Solution(g, np.array(errors)[:, None], template.rank)
+                end = iteration + MORE
+            step = robust_step(template.J, r[None], iteration / max(iterations - 1, 1) if robust else None, basis)
+            g = exp(step) @ g
+            iteration, size = iteration + 1, np.abs(step).max()
 
 
 def chain(layers: Layers, on: list[np.ndarray]) -> np.ndarray:
@@ -160,6 +263,17 @@ def weighted_step(J: np.ndarray, weight: np.ndarray, r: np.ndarray, basis: np.nd
     A = (weight.astype(np.float64) @ products).reshape(-1, 6, 6)
     b = (weight * r).astype(np.float64) @ J
     return capped(constrained_step(A, b, basis), MAX_STEP)
+
+
+def robust_step(J: np.ndarray, r: np.ndarray, progress: float | None, basis: np.ndarray | None) -> np.ndarray:
+    """The step of r (S, K) -> (S, 6), its weights as they are at ``progress`` from 0 to 1 through the iterations.
+
+    Without progress, all weights are one.
+    """
+    weight = np.ones_like(r)
+    if progress is not None:
+        weight = geman_mcclure(r, SCALE_FROM + (SCALE_TO - SCALE_FROM) * min(progress, 1.0))
+    return weighted_step(J, weight, r, basis)
 
 
 def constrained_step(A: np.ndarray, b: np.ndarray, basis: np.ndarray | None) -> np.ndarray:

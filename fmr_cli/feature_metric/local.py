@@ -16,6 +16,7 @@ PATCH_RADIUS = 8.0  # voxel edges
 NEIGHBOURS = 256  # looked up in a patch: about what a surface holds within the radius
 PATCH_POINTS = 64  # of them, encoded
 CHANNELS = 10
+FLAT = 0.01  # patch radii: below it, heights say nothing
 CHUNK = 12  # patches encoded at once: their activations stay in the processor's cache
 
 
@@ -63,13 +64,14 @@ def reference_frames(offsets: np.ndarray, valid: np.ndarray, normal: np.ndarray)
     """A frame per patch: offsets (K, n, 3) from the keypoint in patch radii, valid (K, n), normal (K, 3) -> (K, 3, 3).
 
     Rows are the axes. z is the normal, its sign taken so that the patch lies on its negative side; x is the sum of the
-    offsets' tangential parts, near and high points weighted most; both survive a changed sampling.
+    offsets' tangential parts, near and high points weighted most; both survive a changed sampling. Of a flat patch, x
+    points to where most of it lies, so that an outline has features too.
     """
     height = (offsets @ normal[..., None])[..., 0] * valid
     sign = np.where(height.sum(1) > 0, -1, 1).astype(offsets.dtype)
     z = sign[:, None] * normal
     near = np.square(np.maximum(1 - np.sqrt((offsets * offsets).sum(-1)), 0)) * valid
-    weight = near * height * height
+    weight = near * (height * height + FLAT**2)
     # The weighted sum of offsets - height z, less what rounding leaves along z.
     x = (weight[:, None] @ offsets)[:, 0] - (sign * (weight * height).sum(1))[:, None] * z
     x -= (x * z).sum(1, keepdims=True) * z

@@ -165,7 +165,7 @@ def held_out_rank1(model: LocalNet, views: Views) -> float:
     return float(((views.place[best] - views.place).norm(dim=1) < APART).float().mean())
 
 
-def main(out: str, pairs: int = 320, steps: int = 1600, seed: int = 0) -> None:
+def main(out: str, pairs: int = 480, steps: int = 2400, seed: int = 0) -> None:
     """``python -m fmr_cli.training.local models/local.safetensors``: the bundled local encoder, from code alone."""
     from safetensors.torch import save_file
 
