@@ -22,9 +22,10 @@ from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder,
 from fmr_cli.feature_metric.motion import Motion, rotations
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.feature_metric.search import STARTS, Solver, search
-from fmr_cli.preprocess import Surface, distinct, sample, voxel_downsample, working_scale
+from fmr_cli.preprocess import Surface, distinct, sample, thinned, voxel_downsample, working_scale
 
 MIN_POINTS = 10
+AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more in every voxel
 KEYPOINTS = 500
 CONSENSUS_TOLERANCE = 2.0  # voxel edges
 CONSENSUS_POSES = 5
@@ -46,12 +47,14 @@ LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
 class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once.
 
-    points: (N, 3) float64 about ``centre`` (the mean), finite and distinct. edge: the voxel edge that suits this cloud;
-    spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one place.
+    points: (N, 3) float64 about ``centre`` (their mean), at most AT_MOST, finite and distinct. edge: the voxel edge that
+    suits this cloud; spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one place.
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
-        points = cloud.points[np.isfinite(cloud.points).all(1)]
+        rng = np.random.default_rng(seed)
+        points = thinned(cloud.points, AT_MOST, rng)
+        points = points[np.isfinite(points).all(1)]
         self.centre = points.mean(0) if len(points) else np.zeros(3)
         points = distinct(points - self.centre)
         if len(points) == 1 and len(cloud) > 1:
@@ -62,7 +65,7 @@ class Prepared:
             )
         self.name, self.read, self.seed = cloud.name, len(cloud), seed
         self.points = points
-        self.edge, self.spacing = working_scale(self.points, np.random.default_rng(seed))
+        self.edge, self.spacing = working_scale(self.points, rng)
         self._surfaces: dict[float, Surface] = {}
         self._described: dict[float, tuple[np.ndarray, np.ndarray]] = {}
         self._fine: dict[tuple[int, float], np.ndarray] = {}

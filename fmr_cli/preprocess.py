@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 WORKING_VOXELS = 5000  # the voxel edge is chosen so that about so many are occupied
 SAMPLE = 15_000  # points that the choice of the voxel edge looks at
 SPACING_SAMPLE = 1_000  # of them, whose nearest neighbour is looked up
-SCALE_ROUNDS = 5
+SCALE_ROUNDS, SCALE_TOLERANCE = 20, 0.02
 NORMAL_NEIGHBOURS = 16
 CLOSE = 1e-2  # of the squared spread of eigenvalues: the closed form's rounding then shows in the eigenvector
 BORDER = 1e-3  # surface variation that a lean of 1 counts as
@@ -48,6 +48,13 @@ def distinct(points: np.ndarray) -> np.ndarray:
     return points[np.unique(points @ [0.5377, 0.3183, 0.7809], return_index=True)[1]]
 
 
+def thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """At most about ``count`` points, one from each stretch of the array, without a copy of it: (N, 3) -> (M, 3)."""
+    if len(points) <= count:
+        return points
+    return points[((np.arange(count) + rng.random(count)) * (len(points) / count)).astype(int)]
+
+
 def sample(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """At most ``count`` points without repetition, (N, 3) -> (min(N, count), 3)."""
     return points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]
@@ -61,12 +68,14 @@ def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, 
     """
     some = sample(points, SAMPLE, rng)
     tree = cKDTree(some, balanced_tree=False, compact_nodes=False)
-    nearest = tree.query(sample(some, SPACING_SAMPLE, rng), 2)[0][:, 1]
-    spacing = float(np.median(nearest)) * np.sqrt(len(some) / max(len(points), len(some)))
-    edge, least = spacing * np.sqrt(len(some) / WORKING_VOXELS), spacing / 4
+    spacing = float(np.median(tree.query(sample(some, SPACING_SAMPLE, rng), 2)[0][:, 1]))
+    edge, count = spacing, len(some)
     for _ in range(SCALE_ROUNDS):  # on a surface the count falls with the edge's square
-        edge = max(edge * np.sqrt(occupied_voxels(some, edge) / WORKING_VOXELS), least)
-    return edge, spacing
+        if count < (1 + SCALE_TOLERANCE) * WORKING_VOXELS:
+            break
+        edge *= np.sqrt(count / WORKING_VOXELS)
+        count = occupied_voxels(some, edge)
+    return edge, spacing * np.sqrt(len(some) / max(len(points), len(some)))
 
 
 def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -91,7 +100,7 @@ def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray
 def smallest_eigenvector(
     xx: np.ndarray, yy: np.ndarray, zz: np.ndarray, xy: np.ndarray, xz: np.ndarray, yz: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of symmetric 3x3 matrices given by their entries (M,): the unit eigenvector (M, 3) of the smallest eigenvalue (M,).
+    """Of symmetric 3x3 matrices by their entries (M,): the unit eigenvector (M, 3) of the smallest eigenvalue (M,).
 
     In closed form (Smith 1961), several times faster than LAPACK on matrices this small, which still solves the few
     where two eigenvalues are too close for it.
