@@ -47,8 +47,9 @@ LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
 class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once.
 
-    points: (N, 3) float64 about ``centre`` (their mean), at most AT_MOST, finite and distinct. edge: the voxel edge that
-    suits this cloud; spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one place.
+    points: (N, 3) float64 about ``centre`` (their mean), at most AT_MOST, finite and distinct. edge: the voxel edge
+    that suits this cloud; spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one
+    place.
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:

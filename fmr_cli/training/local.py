@@ -24,6 +24,7 @@ from fmr_cli.training import scenes
 
 TEMPERATURE = 0.07
 PER_PAIR = 128  # correspondences taken from a pair of scans
+LEAST = 500  # points of a scan, of which a crop may leave none
 APART = 3.0  # voxel edges: nearer places are not each other's negatives
 
 
@@ -86,8 +87,10 @@ def degrade(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def make_views(rng: np.random.Generator, count: int) -> Views | None:
     """Up to ``count`` corresponding patches of a fresh pair, or None where the two scans hardly share a surface."""
-    pair = [degrade(p, rng) for p in scan_pair(rng)]
-    if min(map(len, pair)) < 500:
+    pair: list[np.ndarray] = list(scan_pair(rng))
+    if min(map(len, pair)) >= LEAST:
+        pair = [degrade(p, rng) for p in pair]
+    if min(map(len, pair)) < LEAST:
         return None
     scales = [working_scale(p, rng) for p in pair]
     edge = max(max(v for v, _ in scales), max(s for _, s in scales)) * rng.uniform(0.8, 1.25)
