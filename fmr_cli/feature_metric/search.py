@@ -26,7 +26,7 @@ class Solver(Protocol):
 
     def __call__(self, points: np.ndarray, /) -> np.ndarray: ...
 
-    def template(self, target: np.ndarray, /) -> Template: ...
+    def template(self, target: np.ndarray, threads: int = 1) -> Template: ...
 
     def solve(
         self,
@@ -36,6 +36,7 @@ class Solver(Protocol):
         iterations: int = 10,
         robust: bool = True,
         basis: np.ndarray | None = None,
+        threads: int = 1,
     ) -> Solution: ...
 
 
@@ -55,15 +56,18 @@ def search(
     starts: np.ndarray,
     robust: bool = True,
     basis: np.ndarray | None = None,
+    threads: int = 1,
 ) -> Found:
     """Solve from every start (S, 4, 4); source (N, 3), target (M, 3) normalised, points in random order.
 
     The coarse round uses the first COARSE_POINTS of both; the best KEPT are refined on all points.
     """
-    template = solver.template(target[:COARSE_POINTS])
-    coarse = solver.solve(template, source[:COARSE_POINTS], starts, COARSE_ITERATIONS, robust, basis)
+    template = solver.template(target[:COARSE_POINTS], threads)
+    coarse = solver.solve(template, source[:COARSE_POINTS], starts, COARSE_ITERATIONS, robust, basis, threads)
     best = distinct(coarse.g, coarse.error, KEPT)
-    fine = solver.solve(solver.template(target), source, coarse.g[best], FINE_ITERATIONS, robust, basis)
+    fine = solver.solve(
+        solver.template(target, threads), source, coarse.g[best], FINE_ITERATIONS, robust, basis, threads
+    )
     order = distinct(fine.g, fine.error, KEPT)
     return Found(fine.g[order], fine.error[order], fine.errors[:, order])
 

@@ -132,7 +132,10 @@ def capped(step: Tensor, size: float) -> Tensor:
 
 
 class OnDevice:
-    """A ``search.Solver``, numpy in and out, computed on the device of a torch encoder."""
+    """A ``search.Solver``, numpy in and out, computed on the device of a torch encoder.
+
+    threads: of the CPU's solver; here without meaning.
+    """
 
     def __init__(self, encoder: Encoder) -> None:
         self.encoder, self.device = encoder, next(encoder.parameters()).device
@@ -146,7 +149,7 @@ class OnDevice:
         return self.encoder(self.tensor(points)[None])[0].cpu().numpy()
 
     @torch.inference_mode()
-    def template(self, target: np.ndarray) -> fast.Template:
+    def template(self, target: np.ndarray, threads: int = 1) -> fast.Template:
         """F(P) and its exact Jacobian: target (N, 3)."""
         made = make_template(self.encoder, self.tensor(target)[None])
         return fast.Template(made.feature[0].cpu().numpy(), made.J[0].cpu().numpy(), int(made.rank))
@@ -160,6 +163,7 @@ class OnDevice:
         iterations: int = 10,
         robust: bool = True,
         basis: np.ndarray | None = None,
+        threads: int = 1,
     ) -> fast.Solution:
         """``solve`` from each g (S, 4, 4) on source (N, 3)."""
         known = Template(

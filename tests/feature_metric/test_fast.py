@@ -11,7 +11,7 @@ import torch
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
-from fmr_cli.feature_metric.fast import FastEncoder
+from fmr_cli.feature_metric.fast import LARGE, FastEncoder
 from fmr_cli.feature_metric.motion import Motion, exp
 from fmr_cli.feature_metric.solver import OnDevice
 
@@ -60,13 +60,36 @@ def test_the_jacobian_is_the_exact_one(fast: FastEncoder, encoder: Encoder, room
 def test_the_pose_of_the_plain_solver(
     fast: FastEncoder, encoder: Encoder, room: np.ndarray, kind: str, degrees: float, robust: bool
 ) -> None:
-    source, target = pair(room, kind, degrees)
+    source, target = pair(room[:3000], kind, degrees)
     plain = OnDevice(encoder)
     expected = plain.solve(plain.template(target), source, START, 10, robust)
     found = fast.solve(fast.template(target), source, START, 10, robust)
     np.testing.assert_allclose(found.g, expected.g, rtol=0, atol=2e-5)
     both = min(len(found.errors), len(expected.errors))  # the end of a copy may come an iteration sooner or later
     np.testing.assert_allclose(found.errors[:both], expected.errors[:both], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("kind", ["copy", "resample", "noise"])
+def test_few_of_many_points_lead_to_the_pose_of_all(
+    fast: FastEncoder, encoder: Encoder, room: np.ndarray, kind: str, robust: bool
+) -> None:
+    source, target = pair(room, kind, 40)
+    assert len(source) >= LARGE
+    plain = OnDevice(encoder)
+    expected = plain.solve(plain.template(target), source, START, 15, robust)
+    found = fast.solve(fast.template(target), source, START, 15, robust)
+    np.testing.assert_allclose(found.g, expected.g, rtol=0, atol=1e-6 if kind == "copy" else 1e-3 if robust else 1e-4)
+    moved = transform_points(found.g[0], source).astype(np.float32)
+    everything = np.abs(fast(moved) - fast(target)).mean()
+    np.testing.assert_allclose(found.error, everything, rtol=0, atol=1e-6)  # the last error is that of all points
+
+
+def test_threads_change_no_bit(fast: FastEncoder, room: np.ndarray) -> None:
+    source, target = pair(room, "resample", 30)
+    one, two = (fast.solve(fast.template(target, n), source, START, threads=n) for n in (1, 2))
+    assert (one.g == two.g).all()
+    assert (one.errors == two.errors).all()
 
 
 def test_constrained_and_many_starts(fast: FastEncoder, encoder: Encoder, room: np.ndarray) -> None:
