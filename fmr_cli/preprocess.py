@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 WORKING_VOXELS = 5000  # the voxel edge is chosen so that about so many are occupied
 SAMPLE = 15_000  # points that the choice of the voxel edge looks at
 NORMAL_NEIGHBOURS = 16
+BORDER = 1e-3  # surface variation that a lean of 1 counts as
 SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
 
 
@@ -64,17 +65,21 @@ def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, 
     return high, spacing
 
 
-def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined, surface variation (M,), and reach (M,).
+def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined, surface variation, reach, lean: (M,) each.
 
     The surface variation is the smallest eigenvalue of the neighbourhood's covariance over their sum (Pauly 2002), 0 on
-    a plane, 1/3 where it is round; the reach is the distance to the last of the 16.
+    a plane, 1/3 where it is round; the reach is the distance to the last of the 16; the lean, how far off their mean is
+    as a share of it: most at a border.
     """
     distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
     neighbours = points[index]
-    centred = neighbours - neighbours.mean(1, keepdims=True)
+    means = neighbours.mean(1, keepdims=True)
+    centred = neighbours - means
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
-    return vectors[:, :, 0], values[:, 0] / np.maximum(values.sum(1), 1e-300), distance[:, -1]
+    variation = np.maximum(values[:, 0], 0) / np.maximum(values.sum(1), 1e-300)
+    lean = np.linalg.norm(means[:, 0] - points, axis=1) / np.maximum(distance[:, -1], 1e-300)
+    return vectors[:, :, 0], variation, distance[:, -1], lean
 
 
 class Surface:
@@ -86,7 +91,7 @@ class Surface:
         self.tree = cKDTree(self.points)
 
     @cached_property
-    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return normals_and_variation(self.points, self.tree)
 
     @property
@@ -97,10 +102,11 @@ class Surface:
     def keypoints(self, count: int) -> np.ndarray:
         """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.
 
-        Where neighbours are far, as in a LiDAR's outskirts, variation is chance: such points come last.
+        Where neighbours are far, as in a LiDAR's outskirts, variation is chance: such points come last. What is flat
+        has its keypoints on its outline.
         """
-        _, variation, reach = self._shape
-        order = np.argsort(-np.where(reach < SPARSE * self.edge, variation, 0.0), kind="stable")
+        _, variation, reach, lean = self._shape
+        order = np.argsort(-np.where(reach < SPARSE * self.edge, variation + BORDER * lean, 0.0), kind="stable")
         first = np.unique(cell_numbers(self.points[order], 2 * self.edge), return_index=True)[1]
         return order[np.sort(first)[:count]]
 

@@ -77,7 +77,7 @@ def test_normals_and_variation_of_a_plane_and_a_corner() -> None:
     x, y = (c.ravel() for c in np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 30)))
     floor, wall = np.stack([x, y, 0 * x], 1), np.stack([0 * x, y, x + 1e-3], 1)
     points = np.vstack([floor, wall])
-    normals, variation, _ = normals_and_variation(points, cKDTree(points))
+    normals, variation, *_ = normals_and_variation(points, cKDTree(points))
     inside = (points[:, 0] > 0.3) & (points[:, 0] < 0.7)
     np.testing.assert_allclose(np.abs(normals[inside]), np.broadcast_to([0, 0, 1], (inside.sum(), 3)), atol=1e-9)
     edge = (points[:, 0] < 0.05) & (points[:, 2] < 0.05)
@@ -95,6 +95,13 @@ def test_keypoints_are_spread_out_and_where_the_surface_bends(scan: np.ndarray) 
     variation = normals_and_variation(surface.points, surface.tree)[1]
     assert variation[index].mean() > 2 * variation.mean()
     assert np.array_equal(index, Surface(scan, edge).keypoints(300))
+
+
+def test_a_sheet_has_its_keypoints_on_its_outline() -> None:
+    sheet = np.random.default_rng(0).uniform(-1, 1, (9000, 3)) * [1, 0.7, 0]
+    surface = Surface(sheet, 0.03)
+    found = np.abs(surface.points[surface.keypoints(100)])
+    assert np.mean((found[:, 0] > 0.94) | (found[:, 1] > 0.64)) > 0.9
 
 
 def test_patches_hold_neighbours_within_the_radius_nearest_first(scan: np.ndarray) -> None:

@@ -16,6 +16,7 @@ PATCH_RADIUS = 8.0  # voxel edges
 NEIGHBOURS = 256  # looked up in a patch: about what a surface holds within the radius
 PATCH_POINTS = 64  # of them, encoded
 CHANNELS = 10
+FLAT = 0.01  # patch radii: below it, heights say nothing
 
 
 class LocalEncoder(nn.Module):
@@ -43,14 +44,15 @@ def reference_frames(offsets: Tensor, valid: Tensor, normal: Tensor) -> Tensor:
     """A frame per patch: offsets (K, n, 3) from the keypoint in patch radii, valid (K, n), normal (K, 3) -> (K, 3, 3).
 
     Rows are the axes. z is the normal, its sign taken so that the patch lies on its negative side; x is the sum of the
-    offsets' tangential parts, near and high points weighted most; both survive a changed sampling.
+    offsets' tangential parts, near and high points weighted most; both survive a changed sampling. Of a flat patch, x
+    points to where most of it lies, so that an outline has features too.
     """
     height = torch.einsum("kni,ki->kn", offsets, normal) * valid
     z = torch.where(height.sum(-1, keepdim=True) > 0, -normal, normal)
     height = torch.einsum("kni,ki->kn", offsets, z) * valid
     near = (1 - offsets.norm(dim=-1)).clamp_min(0).square() * valid
     tangential = offsets - height[..., None] * z[:, None]
-    x = ((near * height.square())[..., None] * tangential).sum(1)
+    x = ((near * (height.square() + FLAT**2))[..., None] * tangential).sum(1)
     x = x - (x * z).sum(-1, keepdim=True) * z
     x = nn.functional.normalize(x, dim=-1, eps=1e-12)
     return torch.stack([x, torch.linalg.cross(z, x), z], 1)
