@@ -32,9 +32,7 @@ CONSENSUS_TOLERANCE = 2.0  # voxel edges
 CONSENSUS_POSES = 5
 RANKING_POINTS = 800
 LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; the polish does the rest
-FINE = LEVELS[
-    1:
-]  # enough from matched features, which are within CONSENSUS_TOLERANCE; its residual goes to the verdict
+FINE = LEVELS[1:]  # enough from matched features, which are within CONSENSUS_TOLERANCE
 DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
 CHANCE_POSES = 8
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
@@ -110,16 +108,20 @@ class Prepared:
 
 @dataclass
 class Candidate:
-    """A pose with what speaks for it. start: where it came from; errors: mean |r| of the IC solver that led to it."""
+    """A pose with what speaks for it. start: where it came from; errors: mean |r| of the IC solver that led to it.
+
+    confidence: that it is right, given the other candidates; set once these are known.
+    """
 
     T: np.ndarray
     start: str
     errors: list[float]
     evidence: verdict.Evidence
+    confidence: float = 0.0
 
-    @property
-    def confidence(self) -> float:
-        return verdict.confidence(self.evidence)
+    @cached_property
+    def odds(self) -> float:
+        return verdict.odds(self.evidence)
 
 
 @dataclass
@@ -202,17 +204,17 @@ class Pair:
         return int((distance < CONSENSUS_TOLERANCE * self.edge).sum())
 
     @cached_property
-    def agreed(self) -> list[tuple[np.ndarray, int, float]]:
-        """Poses that matches agree on, best first, each with its votes and its coincidence."""
+    def agreed(self) -> list[tuple[np.ndarray, float]]:
+        """Poses that matches agree on, best first, each with its coincidence."""
         x, y = (torch.from_numpy((k / self.edge).astype(np.float32)) for k in self.matches)
         motion = Motion(self.motion.dof, self.motion.up, self.motion.lift / self.edge)
         T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0].double().numpy()
         T[:, :3, 3] *= self.edge
-        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in T]
+        return [(pose, self.coincidence(pose)) for pose in T]
 
     def from_features(self) -> list[Start]:
         """Matched local features and their spatial consensus: any rotation, part overlap."""
-        return [Start(T, "features", []) for T, _, _ in self.agreed]
+        return [Start(T, "features", []) for T, _ in self.agreed]
 
     @torch.inference_mode()
     def from_search(self) -> list[Start]:
@@ -240,17 +242,17 @@ class Pair:
     # How a pose is refined and judged.
 
     def coincidence(self, T: np.ndarray) -> float:
-        """How much of the source comes close to the target at T, from 0 to 1, on few points."""
-        some = sample(self.s.points, RANKING_POINTS, np.random.default_rng(self.seed))
+        """How much of the source comes close to the target at T, normals along, from 0 to 1, on few points."""
+        some = sample(np.hstack([self.s.points, self.s.normals]), RANKING_POINTS, np.random.default_rng(self.seed))
         reach = 2 * self.edge
-        d = self.t.tree.query(some @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)[0]
-        return float(np.maximum(0, 1 - d / reach).mean())
+        d, i = self.t.tree.query(some[:, :3] @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)
+        here = np.isfinite(d)
+        cosine = np.einsum("ni,ni->n", some[here, 3:] @ T[:3, :3].T, self.t.normals[i[here]])
+        return float(((1 - d[here] / reach) * cosine**4).sum() / len(some))
 
-    def refine(
-        self, T: np.ndarray, levels: tuple[tuple[float, float], ...], iterations: int
-    ) -> tuple[np.ndarray, float]:
-        """Patch by patch from coarse to fine: the pose, and the median patch error over the mean feature norm."""
-        g, error = torch.from_numpy(T.copy()), float("nan")
+    def refine(self, T: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
+        """The pose refined patch by patch from coarse to fine."""
+        g = torch.from_numpy(T.copy())
         g[:3, 3] /= self.length
         for radius, coarseness in levels:
             s, t = (x.surface(self.edge * coarseness) for x in (self.source, self.target))
@@ -258,14 +260,11 @@ class Pair:
             centres = torch.from_numpy(self.patch_centres(s, t, g.numpy(), reach) / self.length).float()
             with torch.inference_mode():
                 template = patch_template(self.encoder, centres, balls(t, reach, self.length), reach / self.length)
-                fit = refine(
-                    self.encoder, template, balls(s, reach, self.length), g, iterations, self.motion.basis()
-                )  # fmt: skip
-            g = fit.g
-            error = float(fit.error.nanmedian() / template.feature.norm(dim=1).mean().clamp_min(1e-12))
+                look = balls(s, reach, self.length)
+                g = refine(self.encoder, template, look, g, PATCH_ITERATIONS, self.motion.basis()).g
         T = g.numpy().copy()
         T[:3, 3] *= self.length
-        return T, error
+        return T
 
     def patch_centres(self, s: Surface, t: Surface, g: np.ndarray, reach: float) -> np.ndarray:
         """Points of the target, spread evenly, that the source comes near to at g: (P, 3)."""
@@ -274,22 +273,17 @@ class Pair:
         common = some[np.isfinite(s.tree.query(back, distance_upper_bound=reach / 2)[0])]
         return (common if len(common) >= 8 else some)[:PATCHES]
 
-    def judged(self, T: np.ndarray, start: Start, patches: float) -> Candidate:
-        """A pose with the evidence gathered at it; patches: the median patch error there."""
-        votes, coincidence = self.votes(T), self.coincidence(T)
-        rivals = [(v, c) for pose, v, c in self.agreed + self.chance if not self.same(T, pose)]
-        fit = verdict.fit(self.s, self.t, T)
+    def judged(self, T: np.ndarray, start: Start) -> Candidate:
+        """A pose with the evidence gathered at it."""
+        rivals = [coincidence for pose, coincidence in self.agreed + self.chance if not self.same(T, pose)]
         return Candidate(
             T,
             start.name,
             start.errors,
             verdict.Evidence(
-                **fit,
-                patches=patches if np.isfinite(patches) else 1.0,
-                votes=votes,
-                votes_over_rival=(votes + 1) / (max(v for v, _ in rivals) + 1),
-                fit_over_rival=coincidence / max(max(c for _, c in rivals), 1e-3),
-                contrast=self.chance_error / max(self.feature_error(T), 1e-9),
+                **verdict.fit(self.s, self.t, T),
+                votes=self.votes(T),
+                fit_over_rival=self.coincidence(T) / max(*rivals, 1e-3),
             ),
         )
 
@@ -299,24 +293,16 @@ class Pair:
         return bool(angle < DISTINCT_DEGREES and np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge)
 
     @cached_property
-    def chance(self) -> list[tuple[np.ndarray, int, float]]:
-        """Poses as good as random, rotations about the means, each with its votes and its coincidence."""
+    def chance(self) -> list[tuple[np.ndarray, float]]:
+        """Poses as good as random, rotations about the means, each with its coincidence."""
         poses = [self.restored(g) for g in rotations(CHANCE_POSES).numpy()]
-        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in poses]
-
-    @cached_property
-    def chance_error(self) -> float:
-        """The median of the global feature's error at those."""
-        return float(np.median([self.feature_error(pose) for pose, _, _ in self.chance]))
+        return [(pose, self.coincidence(pose)) for pose in poses]
 
     def candidate(self, start: Start, polished: bool, scale: bool) -> Candidate:
         """A start, refined patch by patch, polished where asked, and judged."""
         T = self.motion.exact(torch.from_numpy(start.T)).numpy()
-        T, patches = self.refine(T, FINE if start.name == "features" else LEVELS, PATCH_ITERATIONS)
-        if polished:
-            T = self.polished(T, scale)
-            _, patches = self.refine(T, FINE, 0)
-        return self.judged(T, start, patches)
+        T = self.refine(T, FINE if start.name == "features" else LEVELS)
+        return self.judged(self.polished(T, scale) if polished else T, start)
 
     def polished(self, T: np.ndarray, scale: bool) -> np.ndarray:
         """The pose after the last geometric step."""

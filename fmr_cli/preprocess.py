@@ -66,7 +66,7 @@ def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, 
 
 
 def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined, surface variation, reach, lean: (M,) each.
+    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined; surface variation, reach, lean (M,) each.
 
     The surface variation is the smallest eigenvalue of the neighbourhood's covariance over their sum (Pauly 2002), 0 on
     a plane, 1/3 where it is round; the reach is the distance to the last of the 16; the lean, how far off their mean is
@@ -98,6 +98,16 @@ class Surface:
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals of undetermined sign."""
         return self._shape[0]
+
+    @cached_property
+    def unevenness(self) -> tuple[np.ndarray, np.ndarray]:
+        """How far the nearest 3 lie off each point's tangent plane, own unit, and 1 - |cosine| of their normals: (M,).
+
+        What curvature and noise make of two samples of one surface.
+        """
+        index = self.tree.query(self.points, 4)[1][:, 1:]
+        off = np.einsum("nki,ni->nk", self.points[index] - self.points[:, None], self.normals)
+        return np.abs(off).mean(1), 1 - np.abs(np.einsum("nki,ni->nk", self.normals[index], self.normals)).mean(1)
 
     def keypoints(self, count: int) -> np.ndarray:
         """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.
