@@ -73,7 +73,7 @@ def bare_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 def thing(rng: np.random.Generator) -> np.ndarray:
     """An object all round, of any shape, some of them flattened: (20000, 3)."""
-    makers = [lambda rng, n: shapes.shape(rng, n)] * 4 + [m for m in shapes.OTHERS]
+    makers = [shapes.shape, shapes.shape, *shapes.OTHERS]
     points = makers[rng.integers(len(makers))](rng, 20_000)
     flat = rng.uniform(0.01, 0.3) if rng.random() < 0.25 else 1.0  # sheets, reliefs
     return points * np.where(np.arange(3) == rng.integers(3), flat, 1.0)
