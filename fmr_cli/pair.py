@@ -34,7 +34,6 @@ LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coa
 FINE = LEVELS[1:]
 DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
 CHANCE_POSES = 8
-CONTRAST_POINTS = 256  # of each cloud, whose global feature tells a pose from chance
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
 POLISH_TARGET, POLISH_SOURCE = 24_000, 8_000
 EXACT_TARGET = 200_000  # points of the target that the winner is polished against once more, each its own
@@ -109,16 +108,20 @@ class Prepared:
 
 @dataclass
 class Candidate:
-    """A pose with what speaks for it. start: where it came from; errors: mean |r| of the IC solver that led to it."""
+    """A pose with what speaks for it. start: where it came from; errors: mean |r| of the IC solver that led to it.
+
+    confidence: that it is right, given the other candidates; set once these are known.
+    """
 
     T: np.ndarray
     start: str
     errors: list[float]
     evidence: verdict.Evidence
+    confidence: float = 0.0
 
-    @property
-    def confidence(self) -> float:
-        return verdict.confidence(self.evidence)
+    @cached_property
+    def odds(self) -> float:
+        return verdict.odds(self.evidence)
 
 
 @dataclass
@@ -168,7 +171,10 @@ class Pair:
             for x, c in zip((self.s, self.t), self.origins, strict=True)
         )
 
-        self._features: dict[int | None, np.ndarray] = {}
+    @cached_property
+    def feature(self) -> np.ndarray:
+        """F(P) of the target."""
+        return self.encoder(self.P)
 
     @cached_property
     def template(self) -> Template:
@@ -208,17 +214,17 @@ class Pair:
         return int((distance < CONSENSUS_TOLERANCE * self.edge).sum())
 
     @cached_property
-    def agreed(self) -> list[tuple[np.ndarray, int, float]]:
-        """Poses that matches agree on, best first, each with its votes and its coincidence."""
+    def agreed(self) -> list[tuple[np.ndarray, float]]:
+        """Poses that matches agree on, best first, each with its coincidence."""
         x, y = (k / self.edge for k in self.matches)
         motion = Motion(self.motion.dof, self.motion.up, self.motion.lift / self.edge)
         T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0]
         T[:, :3, 3] *= self.edge
-        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in T]
+        return [(pose, self.coincidence(pose)) for pose in T]
 
     def from_features(self) -> list[Start]:
         """Matched local features and their spatial consensus: any rotation, part overlap."""
-        return [Start(T, "features", []) for T, _, _ in self.agreed]
+        return [Start(T, "features", []) for T, _ in self.agreed]
 
     def from_search(self) -> list[Start]:
         """The global feature from rotations spread over all that are allowed: any rotation, full overlap."""
@@ -243,15 +249,19 @@ class Pair:
     # How a pose is refined and judged.
 
     @cached_property
-    def some(self) -> np.ndarray:
-        """A few of the source's points."""
-        return sample(self.s.points, RANKING_POINTS, np.random.default_rng(self.seed))
+    def some(self) -> tuple[np.ndarray, np.ndarray]:
+        """A few of the source's points, and their normals."""
+        both = sample(np.hstack([self.s.points, self.s.normals]), RANKING_POINTS, np.random.default_rng(self.seed))
+        return both[:, :3], both[:, 3:]
 
     def coincidence(self, T: np.ndarray) -> float:
-        """How much of the source comes close to the target at T, from 0 to 1, on few points."""
+        """How much of the source comes close to the target at T, normals along, from 0 to 1, on few points."""
+        points, normals = self.some
         reach = 2 * self.edge
-        d = self.t.tree.query(self.some @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)[0]
-        return float(np.maximum(0, 1 - d / reach).mean())
+        d, i = self.t.tree.query(points @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)
+        here = np.isfinite(d)
+        cosine = np.einsum("ni,ni->n", normals[here] @ T[:3, :3].T, self.t.normals[i[here]])
+        return float(((1 - d[here] / reach) * cosine**4).sum() / len(points))
 
     def refine(self, T: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
         """The pose after the feature metric of local patches, from coarse to fine."""
@@ -276,19 +286,15 @@ class Pair:
 
     def judged(self, T: np.ndarray, start: Start) -> Candidate:
         """A pose with the evidence gathered at it."""
-        votes, coincidence = self.votes(T), self.coincidence(T)
-        rivals = [(v, c) for pose, v, c in self.agreed + self.chance if not self.same(T, pose)]
-        fit = verdict.fit(self.s, self.t, T)
+        rivals = [coincidence for pose, coincidence in self.agreed + self.chance if not self.same(T, pose)]
         return Candidate(
             T,
             start.name,
             start.errors,
             verdict.Evidence(
-                **fit,
-                votes=votes,
-                votes_over_rival=(votes + 1) / (max(v for v, _ in rivals) + 1),
-                fit_over_rival=coincidence / max(max(c for _, c in rivals), 1e-3),
-                contrast=self.chance_error / max(self.feature_error(T, CONTRAST_POINTS), 1e-9),
+                **verdict.fit(self.s, self.t, T),
+                votes=self.votes(T),
+                fit_over_rival=self.coincidence(T) / max(*rivals, 1e-3),
             ),
         )
 
@@ -298,15 +304,10 @@ class Pair:
         return bool(angle < DISTINCT_DEGREES and np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge)
 
     @cached_property
-    def chance(self) -> list[tuple[np.ndarray, int, float]]:
-        """Poses as good as random, rotations about the means, each with its votes and its coincidence."""
+    def chance(self) -> list[tuple[np.ndarray, float]]:
+        """Poses as good as random, rotations about the means, each with its coincidence."""
         poses = [self.restored(g) for g in rotations(CHANCE_POSES)]
-        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in poses]
-
-    @cached_property
-    def chance_error(self) -> float:
-        """The median of the global feature's error at those."""
-        return float(np.median([self.feature_error(pose, CONTRAST_POINTS) for pose, _, _ in self.chance]))
+        return [(pose, self.coincidence(pose)) for pose in poses]
 
     def candidate(self, start: Start, polished: bool, scale: bool) -> Candidate:
         """A start, refined patch by patch, polished where asked, and judged."""
@@ -345,12 +346,10 @@ class Pair:
         source = sample(self.source.points, POLISH_SOURCE, np.random.default_rng(self.seed))
         return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, own=True), T)
 
-    def feature_error(self, T: np.ndarray, points: int | None = None) -> float:
-        """Mean |F(T Q) - F(P)| of the global feature at a pose; points: how many of Q and P it sees, None for all."""
+    def feature_error(self, T: np.ndarray) -> float:
+        """Mean |F(T Q) - F(P)| of the global feature at a pose."""
         g = self.normalised(T).astype(np.float32)
-        if points not in self._features:
-            self._features[points] = self.encoder(self.P[:points])
-        return float(np.abs(self.encoder(self.Q[:points] @ g[:3, :3].T + g[:3, 3]) - self._features[points]).mean())
+        return float(np.abs(self.encoder(self.Q @ g[:3, :3].T + g[:3, 3]) - self.feature).mean())
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:

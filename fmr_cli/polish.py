@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.preprocess import Surface, normals_and_variation
+from fmr_cli.preprocess import Surface, neighbours, normals_and_variation
 
 ITERATIONS = 30
 COVARIANCE_NEIGHBOURS = 10
@@ -86,7 +86,7 @@ def constrained(
 ) -> np.ndarray:
     """Point-to-plane from T (4x4) within the span of basis (6, d), and with one scale factor where asked."""
     tree = cKDTree(target)
-    normals = normals_and_variation(target, tree)[0]
+    normals = normals_and_variation(target, *neighbours(target, tree))[0]
     B = np.zeros((7, basis.shape[1] + scale))
     B[:6, : basis.shape[1]] = basis
     if scale:

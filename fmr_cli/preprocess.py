@@ -78,14 +78,20 @@ def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, 
     return edge, spacing * np.sqrt(len(some) / max(len(points), len(some)))
 
 
-def normals_and_variation(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of the nearest 16 points: unit normals (M, 3), their sign undetermined; surface variation, reach, lean (M,) each.
+def neighbours(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest 16 of each point, itself first: distances and rows, (M, 16) each, or fewer where there are fewer."""
+    return tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
+
+
+def normals_and_variation(
+    points: np.ndarray, distance: np.ndarray, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of each point's ``neighbours``: unit normals (M, 3), their sign undetermined; variation, reach, lean (M,) each.
 
     The surface variation is the smallest eigenvalue of the neighbourhood's covariance over their sum (Pauly 2002), 0 on
-    a plane, 1/3 where it is round; the reach is the distance to the last of the 16; the lean, how far off their mean is
+    a plane, 1/3 where it is round; the reach is the distance to the last of them; the lean, how far off their mean is
     as a share of it: most at a border.
     """
-    distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
     x, y, z = (c[index] - c[:, None] for c in np.ascontiguousarray(points.T))
     means = [c.mean(1, keepdims=True) for c in (x, y, z)]
     for c, mean in zip((x, y, z), means, strict=True):
@@ -141,13 +147,29 @@ class Surface:
         self.tree = cKDTree(self.points)
 
     @cached_property
+    def _near(self) -> tuple[np.ndarray, np.ndarray]:
+        return neighbours(self.points, self.tree)
+
+    @cached_property
     def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        return normals_and_variation(self.points, self.tree)
+        return normals_and_variation(self.points, *self._near)
 
     @property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals of undetermined sign."""
         return self._shape[0]
+
+    @cached_property
+    def unevenness(self) -> tuple[np.ndarray, np.ndarray]:
+        """How far the nearest 3 lie off each point's tangent plane, own unit, and 1 - |cosine| of their normals: (M,).
+
+        What curvature and noise make of two samples of one surface.
+        """
+        p, n, off, cosine = self.points, self.normals, [], []
+        for there in self._near[1].T[1:4]:
+            off.append(np.abs(np.einsum("ni,ni->n", p[there] - p, n)))
+            cosine.append(np.abs(np.einsum("ni,ni->n", n[there], n)))
+        return np.mean(off, axis=0), 1 - np.mean(cosine, axis=0)
 
     def keypoints(self, count: int) -> np.ndarray:
         """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.

@@ -29,7 +29,8 @@ from fmr_cli.weights import bundled_local_encoder, fast_encoder, solver
 
 Init = Literal["auto", "search", "features", "centroid", "identity"]
 REFINED = 3  # starts that are refined, of each kind
-SURE, RIVAL = 0.95, 0.85  # once a pose is that sure, only starts that coincide nearly as much are looked at
+SURE, RIVAL = 0.95, 0.8  # once a pose is that sure, only starts that coincide nearly as much are looked at
+SETTLED = 0.8  # once a pose is that sure, no other kind of start is tried
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
 
@@ -76,7 +77,7 @@ class Registration:
 
     T_target_source: (4, 4) float64, x_target = s R x_source + t, in the clouds' own unit; s is 1 unless asked for.
     status: "aligned", or "uncertain" where the evidence at the pose speaks against it.
-    confidence: the probability, from 0 to 1, that the pose is right.
+    confidence: the probability, from 0 to 1, that the pose is right; poses that fit as well share it.
     overlap: share of the smaller cloud's points that have a counterpart in the other one.
     inlier_rmse: root mean square distance of those counterparts, own unit.
     feature_error_before, feature_error_after: mean |F(g Q) - F(P)| of the global feature as the files are, and at T.
@@ -87,8 +88,8 @@ class Registration:
     information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's
         mean; rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.
     undetermined: the directions that the scans hardly determine, in words.
-    alternatives: other poses that would be called aligned too, as of a symmetric shape, best first: T_target_source,
-        confidence, feature_error.
+    alternatives: other poses that would be called aligned if alone, as of a symmetric shape, best first:
+        T_target_source, confidence, feature_error.
     evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
     """
 
@@ -225,7 +226,7 @@ def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
 
 
 def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candidate]:
-    """Candidates, best first, from the starts that the options name; "auto" goes on while none is aligned."""
+    """Candidates, best first, from the starts that the options name; "auto" goes on while none is settled."""
     candidates: list[Candidate] = []
     for name, starts in start_makers(pair, options):
         with stage(seconds, name):
@@ -233,20 +234,19 @@ def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candid
                 ((pair.coincidence(s.T), s) for s in starts() if within_bounds(s.T, pair, options)), key=lambda x: -x[0]
             )
         with stage(seconds, "refine"):
-            for coincidence, start in ranked[:REFINED]:
-                sure = candidates and max(c.confidence for c in candidates) >= SURE
-                if sure and coincidence < RIVAL * ranked[0][0]:
+            for i, (coincidence, start) in enumerate(ranked):
+                enough = i >= REFINED or (candidates and candidates[0].confidence >= SURE)
+                if enough and coincidence < RIVAL * ranked[0][0]:
                     break
                 candidate = pair.candidate(start, options.refine, options.scale)
                 if within_bounds(candidate.T, pair, options):
-                    candidates.append(candidate)
-        candidates.sort(key=lambda c: -c.confidence)
-        if candidates and candidates[0].confidence >= verdict.ALIGNED:
+                    candidates = weighed([*candidates, candidate], pair)
+        if candidates and candidates[0].confidence >= SETTLED:
             break
     if not candidates:  # every pose found lies beyond --max-angle or --max-shift
         here = Start(local_pose(np.eye(4), pair), "identity", [])
-        candidates = [pair.judged(here.T, here)]
-    return distinct(candidates, pair)
+        candidates = weighed([pair.judged(here.T, here)], pair)
+    return candidates
 
 
 def start_makers(pair: Pair, options: Options) -> list[tuple[str, Callable[[], list[Start]]]]:
@@ -285,13 +285,13 @@ def within_bounds(T: np.ndarray, pair: Pair, options: Options) -> bool:
     )
 
 
-def distinct(candidates: list[Candidate], pair: Pair) -> list[Candidate]:
-    """The candidates without those that are another, better one's pose."""
+def weighed(candidates: list[Candidate], pair: Pair) -> list[Candidate]:
+    """The candidates, best first, without those that are a better one's pose; each confidence given the others."""
     kept: list[Candidate] = []
-    for c in candidates:
+    for c in sorted(candidates, key=lambda c: -c.odds):
         if not any(pair.same(c.T, k.T) for k in kept):
             kept.append(c)
-    return kept
+    return [replace(c, confidence=p) for c, p in zip(kept, verdict.confidences([c.odds for c in kept]), strict=True)]
 
 
 def describe(
@@ -321,7 +321,7 @@ def describe(
                 "feature_error": pair.feature_error(c.T),
             }
             for c in others
-            if c.confidence >= verdict.ALIGNED
+            if c.odds >= 1  # by itself more likely right than not
         ]
         warnings = ["other poses fit about as well, see alternatives"] if alternatives else []
         before, after = pair.feature_error(local_pose(np.eye(4), pair)), pair.feature_error(best.T)

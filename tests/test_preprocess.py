@@ -10,6 +10,7 @@ from fmr_cli.preprocess import (
     WORKING_VOXELS,
     Surface,
     distinct,
+    neighbours,
     normals_and_variation,
     occupied_voxels,
     sample,
@@ -78,7 +79,7 @@ def test_normals_and_variation_of_a_plane_and_a_corner() -> None:
     x, y = (c.ravel() for c in np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 30)))
     floor, wall = np.stack([x, y, 0 * x], 1), np.stack([0 * x, y, x + 1e-3], 1)
     points = np.vstack([floor, wall])
-    normals, variation, *_ = normals_and_variation(points, cKDTree(points))
+    normals, variation, *_ = normals_and_variation(points, *neighbours(points, cKDTree(points)))
     inside = (points[:, 0] > 0.3) & (points[:, 0] < 0.7)
     np.testing.assert_allclose(np.abs(normals[inside]), np.broadcast_to([0, 0, 1], (inside.sum(), 3)), atol=1e-9)
     edge = (points[:, 0] < 0.05) & (points[:, 2] < 0.05)
@@ -93,7 +94,7 @@ def test_keypoints_are_spread_out_and_where_the_surface_bends(scan: np.ndarray) 
     assert len(index) == len(set(index)) == 300
     cells = np.floor((surface.points[index] - surface.points.min(0)) / (2 * edge))
     assert len(np.unique(cells, axis=0)) == 300
-    variation = normals_and_variation(surface.points, surface.tree)[1]
+    variation = normals_and_variation(surface.points, *neighbours(surface.points, surface.tree))[1]
     assert variation[index].mean() > 2 * variation.mean()
     assert np.array_equal(index, Surface(scan, edge).keypoints(300))
 
@@ -127,8 +128,9 @@ def test_patches_hold_neighbours_within_the_radius_nearest_first(scan: np.ndarra
 def test_the_closed_form_of_the_normals_is_that_of_lapack(spread: tuple[float, ...]) -> None:
     points = np.random.default_rng(0).normal(size=(1000, 3)) * spread
     tree = cKDTree(points)
-    normals, variation, *_ = normals_and_variation(points, tree)
-    near = points[tree.query(points, 16)[1]]
+    distance, index = neighbours(points, tree)
+    normals, variation, *_ = normals_and_variation(points, distance, index)
+    near = points[index]
     centred = near - near.mean(1, keepdims=True)
     C = np.swapaxes(centred, 1, 2) @ centred
     values, sums = np.linalg.eigvalsh(C), np.trace(C, axis1=1, axis2=2)
