@@ -86,7 +86,7 @@ def few(points: np.ndarray) -> np.ndarray:
 class FastEncoder:
     """F and the solver on it, for one cloud on the CPU.
 
-    threads: how many of Python's to spread the work over, each with BLAS on one thread; it changes no bit of a result.
+    threads: how many of Python's to spread the work over; it changes no bit of a result. BLAS is best kept to one.
     """
 
     def __init__(self, layers: Layers) -> None:
@@ -237,7 +237,7 @@ class FastEncoder:
 
         At first these are few, spread over the source; once a step is small, those of all points that do better than
         the few in some channel. Whether they were all is seen at the end, at the pose found: if not, it goes on with
-        those that were missed, until no step exceeds ``SETTLED``.
+        those that were missed, for at least MORE iterations. The last error is that of all points.
         """
         active, errors, near, iteration, end, size = few(source), [], False, 0, iterations, np.inf
         while True:
@@ -252,7 +252,7 @@ class FastEncoder:
             if finished:
                 if missed <= MISSED * errors[-1] or end > iterations:
                     return Solution(g, np.array(errors)[:, None], template.rank)
-                end = iteration + MORE
+                end = max(iterations, iteration + MORE)
             step = robust_step(template.J, r[None], iteration / max(iterations - 1, 1) if robust else None, basis)
             g = exp(step) @ g
             iteration, size = iteration + 1, np.abs(step).max()
