@@ -6,7 +6,7 @@ order and translates to the files' coordinates.
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -97,12 +97,12 @@ class Prepared:
             self._fine[count, edge] = sample(points, count, np.random.default_rng(self.seed))
         return self._fine[count, edge]
 
-    def for_gicp(self, count: int, edge: float, own: bool = False) -> polish.GicpCloud:
+    def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> polish.GicpCloud:
         """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""
         if (count, edge, own) not in self._gicp:
             rng = np.random.default_rng(self.seed)
             points = sample(self.points, count, rng) if own else self.fine(count, edge)
-            self._gicp[count, edge, own] = polish.GicpCloud(points, edge)
+            self._gicp[count, edge, own] = polish.GicpCloud(points, edge, threads)
         return self._gicp[count, edge, own]
 
 
@@ -151,7 +151,9 @@ class Pair:
         iterations: int,
         robust: bool,
         seed: int,
+        threads: int = 1,
     ) -> None:
+        self.threads = threads
         self.source, self.target, self.motion = source, target, motion
         self.encoder, self.solver, self.local = encoder, solver, local
         self.iterations, self.robust, self.seed = iterations, robust, seed
@@ -195,10 +197,10 @@ class Pair:
 
     # Where a pose may start.
 
-    def describe(self, pool: Executor) -> None:
-        """Works out what concerns one cloud alone, both side by side."""
-        for done in [pool.submit(cloud.described, self.edge, self.local) for cloud in (self.source, self.target)]:
-            done.result()
+    def describe(self) -> None:
+        """Works out what concerns one cloud alone; both side by side where there are two threads for it."""
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(lambda cloud: cloud.described(self.edge, self.local), (self.source, self.target)))
 
     @cached_property
     def matches(self) -> tuple[np.ndarray, np.ndarray]:
@@ -323,14 +325,16 @@ class Pair:
         if scale or self.motion.dof != "rigid":
             s, t = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
             return polish.constrained(s, t, T, self.edge, self.motion.basis(), scale)
-        target = self.target.for_gicp(POLISH_TARGET, self.edge)
+        target = self.target.for_gicp(POLISH_TARGET, self.edge, self.threads)
         return self.gicp(self.source.fine(POLISH_SOURCE, self.edge), target, T)
 
     def gicp(self, source: np.ndarray, target: polish.GicpCloud, T: np.ndarray) -> np.ndarray:
         """GICP from T of those of the source's points that are in reach of the target."""
         moved = source @ T[:3, :3].T + T[:3, 3]
         near = source[np.isfinite(self.t.tree.query(moved, distance_upper_bound=POLISH_REACH * self.edge)[0])]
-        return T if len(near) < MIN_POINTS else polish.gicp(polish.GicpCloud(near, self.edge), target, T, self.edge)
+        if len(near) < MIN_POINTS:
+            return T
+        return polish.gicp(polish.GicpCloud(near, self.edge, self.threads), target, T, self.edge)
 
     def exact(self, T: np.ndarray) -> np.ndarray:
         """The pose after a polish on the points themselves, where the one before saw a share or a grid of them.
@@ -344,7 +348,7 @@ class Pair:
         if np.median(tree.query(some, distance_upper_bound=self.edge)[0]) > COMMON * self.target.spacing:
             return T
         source = sample(self.source.points, POLISH_SOURCE, np.random.default_rng(self.seed))
-        return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, own=True), T)
+        return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, self.threads, own=True), T)
 
     def feature_error(self, T: np.ndarray) -> float:
         """Mean |F(T Q) - F(P)| of the global feature at a pose."""

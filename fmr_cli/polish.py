@@ -20,14 +20,17 @@ WEAK = 2e-3  # of the strongest direction's information: what the noise of the n
 
 
 class GicpCloud:
-    """Points with their covariances as small_gicp takes them, in voxel edges, so that its thresholds have no unit."""
+    """Points with their covariances as small_gicp takes them, in voxel edges, so that its thresholds have no unit.
 
-    def __init__(self, points: np.ndarray, edge: float) -> None:
+    threads: to work on the points, each by itself, so that nothing depends on their number.
+    """
+
+    def __init__(self, points: np.ndarray, edge: float, threads: int = 1) -> None:
         import small_gicp
 
         self.cloud = small_gicp.PointCloud(points / edge)
         self.tree = small_gicp.KdTree(self.cloud)
-        small_gicp.estimate_covariances(self.cloud, self.tree, COVARIANCE_NEIGHBOURS)
+        small_gicp.estimate_covariances(self.cloud, self.tree, COVARIANCE_NEIGHBOURS, threads)
 
 
 def gicp(source: GicpCloud, target: GicpCloud, T: np.ndarray, edge: float) -> np.ndarray:

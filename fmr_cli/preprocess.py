@@ -202,6 +202,8 @@ class Surface:
         found = self.tree.query(centres, min(neighbours, len(self.points)), distance_upper_bound=radius)[1]
         valid = (found < len(self.points)).astype(np.float32)
         found[found == len(self.points)] = 0
-        offsets = ((self.points[found] - centres[:, None]) / radius).astype(np.float32)
+        middle = self.points.mean(0)  # about it, float32 is exact enough
+        offsets = ((self.points - middle) / radius).astype(np.float32)[found]
+        offsets -= ((centres - middle) / radius).astype(np.float32)[:, None]
         offsets *= valid[..., None]
         return offsets, valid, found

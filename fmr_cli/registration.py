@@ -178,25 +178,25 @@ def align(
     where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
     contradict each other.
     """
-    with blas().limit(limits=1), ThreadPoolExecutor(threads) as pool:
-        return _align(source, target, options, pool)
+    with blas().limit(limits=1):
+        return _align(source, target, options, threads)
 
 
 def _align(
-    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, pool: ThreadPoolExecutor
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, threads: int
 ) -> Registration:
     seconds: dict[str, float] = {}
     begin = time.perf_counter()
-    with stage(seconds, "prepare"):
+    with stage(seconds, "prepare"), ThreadPoolExecutor(threads) as pool:
         source, target = pool.map(
-            lambda c: c if isinstance(c, Prepared) else prepare(c, options.seed), (source, target)
+            lambda cloud: cloud if isinstance(cloud, Prepared) else prepare(cloud, options.seed), (source, target)
         )
     best: tuple[Pair, float, list[Candidate]] | None = None
     for factor in scale_factors(source, target, options) if options.scale else (1.0,):
         scaled, given = (source, options) if factor == 1.0 else (source.scaled(factor), unscaled(options, factor))
-        pair = make_pair(scaled, target, options)
+        pair = make_pair(scaled, target, options, threads)
         with stage(seconds, "describe"):
-            pair.describe(pool)
+            pair.describe()
         candidates = find(pair, given, seconds)
         if best is None or candidates[0].confidence > best[2][0].confidence:
             best = pair, factor, candidates
@@ -209,7 +209,7 @@ def _align(
     return found
 
 
-def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
+def make_pair(source: Prepared, target: Prepared, options: Options, threads: int = 1) -> Pair:
     """The two clouds at their common voxel edge, with the encoders and the motions that the options ask for."""
     up = np.asarray(options.up, float)
     if not np.isfinite(up).all() or np.linalg.norm(up) == 0:
@@ -222,6 +222,7 @@ def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
         source, target, fast_encoder(options.model), solver(options.model, options.device), bundled_local_encoder(),
         motion, voxel_size=options.voxel_size, normalize=options.normalize, points=options.points,
         iterations=options.iterations, robust=options.robust, seed=options.seed,
+        threads=threads,
     )  # fmt: skip
 
 

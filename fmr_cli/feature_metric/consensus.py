@@ -72,8 +72,10 @@ def poses_from_seeds(
 
 def residuals(T: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """|R s + t - q| of every match under every pose: T (B, 4, 4), (C, 3), (C, 3) -> (B, C)."""
-    off = T[:, :3, :3] @ source.T + (T[:, :3, 3:] - target.T)  # [B x 3 x C]
-    return np.sqrt((off * off).sum(1))
+    moved = (T[:, :3, :3].reshape(-1, 3) @ source.T).reshape(len(T), 3, -1)
+    moved += T[:, :3, 3:]
+    moved -= target.T
+    return np.sqrt(np.einsum("bic,bic->bc", moved, moved))
 
 
 def distances(points: np.ndarray) -> np.ndarray:
