@@ -41,7 +41,7 @@ def registration_options(
 ) -> dict[str, Any]:
     """What ``fmr_cli.Options`` takes; a transform file for ``init`` is read. Raises FmrError.
 
-    As a dict, since importing Options imports torch, which should not come before the first look at the files.
+    As a dict, since Options comes with scipy, which should not come before the first look at the files.
     """
     return {
         "init": read_init(init), "voxel_size": voxel_size, "normalize": normalize, "points": points, "dof": dof,

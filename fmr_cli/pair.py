@@ -6,33 +6,32 @@ order and translates to the files' coordinates.
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from fmr_cli import polish, verdict
 from fmr_cli.cloud import PointCloud, angle_degrees
 from fmr_cli.errors import RegistrationError
 from fmr_cli.feature_metric.consensus import consensus, match
-from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.fast import FastEncoder, Template
 from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
 from fmr_cli.feature_metric.motion import Motion, rotations
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
-from fmr_cli.feature_metric.search import STARTS, search
-from fmr_cli.feature_metric.solver import Template, make_template, solve
-from fmr_cli.preprocess import Surface, distinct, sample, voxel_downsample, working_scale
+from fmr_cli.feature_metric.search import STARTS, Solver, search
+from fmr_cli.preprocess import Surface, distinct, sample, thinned, voxel_downsample, working_scale
 
 MIN_POINTS = 10
+AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more in every voxel
 KEYPOINTS = 500
 CONSENSUS_TOLERANCE = 2.0  # voxel edges
 CONSENSUS_POSES = 5
 RANKING_POINTS = 800
 LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; the polish does the rest
-FINE = LEVELS[1:]  # enough from matched features, which are within CONSENSUS_TOLERANCE
+FINE = LEVELS[1:]
 DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
 CHANCE_POSES = 8
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
@@ -47,12 +46,15 @@ LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
 class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once.
 
-    points: (N, 3) float64 about ``centre`` (the mean), finite and distinct. edge: the voxel edge that suits this cloud;
-    spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one place.
+    points: (N, 3) float64 about ``centre`` (their mean), at most AT_MOST, finite and distinct. edge: the voxel edge
+    that suits this cloud; spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one
+    place.
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
-        points = cloud.points[np.isfinite(cloud.points).all(1)]
+        rng = np.random.default_rng(seed)
+        points = thinned(cloud.points, AT_MOST, rng)
+        points = points[np.isfinite(points).all(1)]
         self.centre = points.mean(0) if len(points) else np.zeros(3)
         points = distinct(points - self.centre)
         if len(points) == 1 and len(cloud) > 1:
@@ -63,9 +65,9 @@ class Prepared:
             )
         self.name, self.read, self.seed = cloud.name, len(cloud), seed
         self.points = points
-        self.edge, self.spacing = working_scale(self.points, np.random.default_rng(seed))
+        self.edge, self.spacing = working_scale(self.points, rng)
         self._surfaces: dict[float, Surface] = {}
-        self._described: dict[float, tuple[np.ndarray, Tensor]] = {}
+        self._described: dict[float, tuple[np.ndarray, np.ndarray]] = {}
         self._fine: dict[tuple[int, float], np.ndarray] = {}
         self._gicp: dict[tuple[int, float, bool], polish.GicpCloud] = {}
 
@@ -79,15 +81,13 @@ class Prepared:
             self._surfaces[edge] = Surface(self.points, edge)
         return self._surfaces[edge]
 
-    def described(self, edge: float, encoder: LocalEncoder) -> tuple[np.ndarray, Tensor]:
+    def described(self, edge: float, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
         if edge not in self._described:
             surface = self.surface(edge)
             index = surface.keypoints(KEYPOINTS)
-            patches = surface.patches(index, PATCH_RADIUS, NEIGHBOURS)
-            with torch.inference_mode():
-                found = encoder(describe_patches(**{k: torch.from_numpy(v) for k, v in patches.items()}))
-            self._described[edge] = surface.points[index], found
+            patches = describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS))
+            self._described[edge] = surface.points[index], encoder(patches)
         return self._described[edge]
 
     def fine(self, count: int, edge: float) -> np.ndarray:
@@ -134,13 +134,14 @@ class Start:
 
 
 class Pair:
-    """Two clouds at one voxel edge. encoder: F; local: of the patch features; motion: what is allowed."""
+    """Two clouds at one voxel edge. encoder: F; solver: from given starts; local: encodes patches; motion: allowed."""
 
     def __init__(
         self,
         source: Prepared,
         target: Prepared,
-        encoder: Encoder,
+        encoder: FastEncoder,
+        solver: Solver,
         local: LocalEncoder,
         motion: Motion,
         *,
@@ -151,7 +152,8 @@ class Pair:
         robust: bool,
         seed: int,
     ) -> None:
-        self.source, self.target, self.encoder, self.local, self.motion = source, target, encoder, local, motion
+        self.source, self.target, self.motion = source, target, motion
+        self.encoder, self.solver, self.local = encoder, solver, local
         self.iterations, self.robust, self.seed = iterations, robust, seed
         self.edge = voxel_size or pair_edge(source, target)
         self.s, self.t = source.surface(self.edge), target.surface(self.edge)
@@ -164,17 +166,15 @@ class Pair:
         self.length = 2 * float(np.abs(self.t.points - self.t.points.mean(0)).max()) if normalize else 1.0
         self.origins = (self.s.points.mean(0), self.t.points.mean(0)) if normalize else (-source.centre, -target.centre)
         rng = np.random.default_rng(seed)
-        device = next(encoder.parameters()).device
         self.Q, self.P = (
-            torch.from_numpy(((sample(x.points, points, rng) - c) / self.length).astype(np.float32))[None].to(device)
+            ((sample(x.points, points, rng) - c) / self.length).astype(np.float32)
             for x, c in zip((self.s, self.t), self.origins, strict=True)
         )
 
     @cached_property
     def template(self) -> Template:
         """The global feature of the target, and its Jacobian."""
-        with torch.inference_mode():
-            return make_template(self.encoder, self.P)
+        return self.encoder.template(self.P)
 
     # Between the local frames and the encoder's: x -> (x - origin) / length.
 
@@ -190,11 +190,16 @@ class Pair:
 
     # Where a pose may start.
 
+    def describe(self, pool: Executor) -> None:
+        """Works out what concerns one cloud alone, both side by side."""
+        for done in [pool.submit(cloud.described, self.edge, self.local) for cloud in (self.source, self.target)]:
+            done.result()
+
     @cached_property
     def matches(self) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints of source and target whose descriptors match: (C, 3) each, row by row."""
         (p, a), (q, b) = self.source.described(self.edge, self.local), self.target.described(self.edge, self.local)
-        pairs = match(a, b).numpy()
+        pairs = match(a, b)
         return p[pairs[:, 0]], q[pairs[:, 1]]
 
     def votes(self, T: np.ndarray) -> int:
@@ -206,9 +211,9 @@ class Pair:
     @cached_property
     def agreed(self) -> list[tuple[np.ndarray, float]]:
         """Poses that matches agree on, best first, each with its coincidence."""
-        x, y = (torch.from_numpy((k / self.edge).astype(np.float32)) for k in self.matches)
+        x, y = (k / self.edge for k in self.matches)
         motion = Motion(self.motion.dof, self.motion.up, self.motion.lift / self.edge)
-        T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0].double().numpy()
+        T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0]
         T[:, :3, 3] *= self.edge
         return [(pose, self.coincidence(pose)) for pose in T]
 
@@ -216,55 +221,54 @@ class Pair:
         """Matched local features and their spatial consensus: any rotation, part overlap."""
         return [Start(T, "features", []) for T, _ in self.agreed]
 
-    @torch.inference_mode()
     def from_search(self) -> list[Start]:
         """The global feature from rotations spread over all that are allowed: any rotation, full overlap."""
         starts = self.motion.starts(STARTS)
         if self.motion.dof == "planar":
-            up = torch.tensor(self.motion.up, dtype=torch.float64)
-            offset = float(up @ torch.from_numpy(self.origins[0] - self.origins[1]))
+            up = np.array(self.motion.up)
+            offset = up @ (self.origins[0] - self.origins[1])
             starts[:, :3, 3] = (self.motion.lift + offset) / self.length * up
-        found = search(self.encoder, self.Q, self.P, starts, self.robust, self.motion.basis())
-        poses = found.g.double().cpu().numpy()
-        return [Start(self.restored(g), "search", e.tolist()) for g, e in zip(poses, found.errors.T, strict=True)]
+        found = search(self.solver, self.Q, self.P, starts, self.robust, self.motion.basis())
+        return [Start(self.restored(g), "search", e.tolist()) for g, e in zip(found.g, found.errors.T, strict=True)]
 
     def from_pose(self, T: np.ndarray, name: str) -> list[Start]:
         """The allowed pose next to T."""
-        return [Start(self.motion.exact(torch.from_numpy(T)).numpy(), name, [])]
+        return [Start(self.motion.exact(T), name, [])]
 
-    @torch.inference_mode()
     def from_solver(self, T: np.ndarray, name: str) -> list[Start]:
         """Where the IC solver of the paper goes from the allowed pose next to T."""
-        g = torch.from_numpy(self.normalised(self.from_pose(T, name)[0].T)[None]).to(self.Q)
-        found = solve(self.encoder, self.template, self.Q, g, self.iterations, self.robust, self.motion.basis())
-        return [Start(self.restored(found.g[0].double().cpu().numpy()), name, found.errors[:, 0].tolist())]
+        g = self.normalised(self.from_pose(T, name)[0].T)[None]
+        found = self.solver.solve(self.template, self.Q, g, self.iterations, self.robust, self.motion.basis())
+        return [Start(self.restored(found.g[0]), name, found.errors[:, 0].tolist())]
 
     # How a pose is refined and judged.
 
+    @cached_property
+    def some(self) -> np.ndarray:
+        """A few of the source's points, and their normals: (n, 6)."""
+        return sample(np.hstack([self.s.points, self.s.normals]), RANKING_POINTS, np.random.default_rng(self.seed))
+
     def coincidence(self, T: np.ndarray) -> float:
         """How much of the source comes close to the target at T, normals along, from 0 to 1, on few points."""
-        some = sample(np.hstack([self.s.points, self.s.normals]), RANKING_POINTS, np.random.default_rng(self.seed))
         reach = 2 * self.edge
-        d, i = self.t.tree.query(some[:, :3] @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)
+        d, i = self.t.tree.query(self.some[:, :3] @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)
         here = np.isfinite(d)
-        cosine = np.einsum("ni,ni->n", some[here, 3:] @ T[:3, :3].T, self.t.normals[i[here]])
-        return float(((1 - d[here] / reach) * cosine**4).sum() / len(some))
+        cosine = np.einsum("ni,ni->n", self.some[here, 3:] @ T[:3, :3].T, self.t.normals[i[here]])
+        return float(((1 - d[here] / reach) * cosine**4).sum() / len(d))
 
     def refine(self, T: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
-        """The pose refined patch by patch from coarse to fine."""
-        g = torch.from_numpy(T.copy())
+        """The pose after the feature metric of local patches, from coarse to fine."""
+        g = T.copy()
         g[:3, 3] /= self.length
         for radius, coarseness in levels:
             s, t = (x.surface(self.edge * coarseness) for x in (self.source, self.target))
             reach = radius * self.edge
-            centres = torch.from_numpy(self.patch_centres(s, t, g.numpy(), reach) / self.length).float()
-            with torch.inference_mode():
-                template = patch_template(self.encoder, centres, balls(t, reach, self.length), reach / self.length)
-                look = balls(s, reach, self.length)
-                g = refine(self.encoder, template, look, g, PATCH_ITERATIONS, self.motion.basis()).g
-        T = g.numpy().copy()
-        T[:3, 3] *= self.length
-        return T
+            centres = self.patch_centres(s, t, g, reach) / self.length
+            look_s, look_t = balls(s, reach, self.length), balls(t, reach, self.length)
+            template = patch_template(self.encoder.layers, centres, look_t, reach / self.length)
+            g = refine(self.encoder.layers, template, look_s, g, PATCH_ITERATIONS, self.motion.basis()).g
+        g[:3, 3] *= self.length
+        return g
 
     def patch_centres(self, s: Surface, t: Surface, g: np.ndarray, reach: float) -> np.ndarray:
         """Points of the target, spread evenly, that the source comes near to at g: (P, 3)."""
@@ -295,20 +299,23 @@ class Pair:
     @cached_property
     def chance(self) -> list[tuple[np.ndarray, float]]:
         """Poses as good as random, rotations about the means, each with its coincidence."""
-        poses = [self.restored(g) for g in rotations(CHANCE_POSES).numpy()]
+        poses = [self.restored(g) for g in rotations(CHANCE_POSES)]
         return [(pose, self.coincidence(pose)) for pose in poses]
 
     def candidate(self, start: Start, polished: bool, scale: bool) -> Candidate:
         """A start, refined patch by patch, polished where asked, and judged."""
-        T = self.motion.exact(torch.from_numpy(start.T)).numpy()
-        T = self.refine(T, FINE if start.name == "features" else LEVELS)
+        T = self.motion.exact(start.T)
+        if start.name != "features":
+            T = self.refine(T, LEVELS)
+        elif not polished:  # the polish alone comes as far from within CONSENSUS_TOLERANCE
+            T = self.refine(T, FINE)
         return self.judged(self.polished(T, scale) if polished else T, start)
 
     def polished(self, T: np.ndarray, scale: bool) -> np.ndarray:
         """The pose after the last geometric step."""
         if scale or self.motion.dof != "rigid":
             s, t = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
-            return polish.constrained(s, t, T, self.edge, self.motion.basis().numpy(), scale)
+            return polish.constrained(s, t, T, self.edge, self.motion.basis(), scale)
         target = self.target.for_gicp(POLISH_TARGET, self.edge)
         return self.gicp(self.source.fine(POLISH_SOURCE, self.edge), target, T)
 
@@ -332,11 +339,15 @@ class Pair:
         source = sample(self.source.points, POLISH_SOURCE, np.random.default_rng(self.seed))
         return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, own=True), T)
 
-    @torch.inference_mode()
+    @cached_property
+    def target_feature(self) -> np.ndarray:
+        """F(P)."""
+        return self.encoder(self.P)
+
     def feature_error(self, T: np.ndarray) -> float:
         """Mean |F(T Q) - F(P)| of the global feature at a pose."""
-        g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
-        return float(solve(self.encoder, self.template, self.Q, g, 0).error)
+        g = self.normalised(T).astype(np.float32)
+        return float(np.abs(self.encoder(self.Q @ g[:3, :3].T + g[:3, 3]) - self.target_feature).mean())
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:
@@ -348,12 +359,7 @@ def pair_edge(source: Prepared, target: Prepared) -> float:
 def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
     """Look-ups for ``feature_metric.patches``: centres in units of ``length``, balls of ``radius`` (own unit)."""
 
-    def look(centres: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        c = centres.double().numpy() * length
-        index = surface.tree.query(c, BALL_POINTS, distance_upper_bound=radius)[1]
-        valid = index < len(surface.points)
-        offsets = (surface.points[np.where(valid, index, 0)] - c[:, None]) / radius
-        mask = torch.from_numpy(valid.astype(np.float32))
-        return torch.from_numpy(offsets.astype(np.float32)) * mask[..., None], mask, mask.sum(1)
+    def look(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return surface.around(centres * length, radius, BALL_POINTS)[:2]
 
     return look

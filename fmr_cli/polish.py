@@ -16,7 +16,7 @@ from fmr_cli.preprocess import Surface, normals_and_variation
 
 ITERATIONS = 30
 COVARIANCE_NEIGHBOURS = 10
-WEAK = 1e-3  # of the strongest direction's information
+WEAK = 2e-3  # of the strongest direction's information: what the noise of the normals alone pretends to
 
 
 class GicpCloud:
@@ -36,7 +36,7 @@ def gicp(source: GicpCloud, target: GicpCloud, T: np.ndarray, edge: float) -> np
 
     g = T.copy()
     g[:3, 3] /= edge
-    for reach, iterations, epsilon in ((2.0, 10, 1e-3), (1.0, ITERATIONS, 1e-6)):
+    for reach, iterations, epsilon in ((2.0, 10, 1e-2), (1.0, 10, 1e-4)):
         g = small_gicp.align(
             target.cloud, source.cloud, target.tree, g, registration_type="GICP", max_correspondence_distance=reach,
             max_iterations=iterations, rotation_epsilon=epsilon / 10, translation_epsilon=epsilon,

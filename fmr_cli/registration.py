@@ -8,13 +8,16 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
+import scipy
+from threadpoolctl import ThreadpoolController
 
 import fmr_cli
 from fmr_cli import polish, verdict
@@ -22,7 +25,7 @@ from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import FmrError
 from fmr_cli.feature_metric.motion import Dof, Motion
 from fmr_cli.pair import Candidate, Pair, Prepared, Start
-from fmr_cli.weights import bundled_local_encoder, encoder
+from fmr_cli.weights import bundled_local_encoder, fast_encoder, solver
 
 Init = Literal["auto", "search", "features", "centroid", "identity"]
 REFINED = 3  # starts that are refined, of each kind
@@ -136,11 +139,11 @@ def plain(value: Any) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """What could change a result: this tool, torch, numpy, Python and the processor's architecture."""
+    """What could change a result: this tool, the libraries that compute, Python and the processor's architecture."""
     return {
         "fmr": fmr_cli.__version__,
-        "torch": torch.__version__,
         "numpy": np.__version__,
+        "scipy": scipy.__version__,
         "python": platform.python_version(),
         "machine": platform.machine(),
     }
@@ -151,6 +154,12 @@ def prepare(cloud: PointCloud, seed: int = 0) -> Prepared:
     return Prepared(cloud, seed)
 
 
+@cache
+def blas() -> ThreadpoolController:
+    """The libraries behind numpy's matrix products: on blocks as small as ours, their threads only wait."""
+    return ThreadpoolController()
+
+
 @contextmanager
 def stage(seconds: dict[str, float], name: str) -> Iterator[None]:
     """Adds the wall time of its block to ``seconds[name]``."""
@@ -159,24 +168,35 @@ def stage(seconds: dict[str, float], name: str) -> Iterator[None]:
     seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-def align(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options()) -> Registration:
+def align(
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options(), threads: int = 2
+) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
-    A pair is worked on by one thread, so that the answer is the same bit for bit wherever it is asked for; many pairs
-    run side by side. Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or
-    the device, FmrError for options that contradict each other.
+    threads: 2 for what concerns one cloud alone to be done for both side by side, 1 where pairs run side by side
+    already. The answer is the same bit for bit, whatever their number and the machine's. Raises RegistrationError
+    where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
+    contradict each other.
     """
-    if torch.get_num_threads() != 1:
-        torch.set_num_threads(1)
+    with blas().limit(limits=1), ThreadPoolExecutor(threads) as pool:
+        return _align(source, target, options, pool)
+
+
+def _align(
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, pool: ThreadPoolExecutor
+) -> Registration:
     seconds: dict[str, float] = {}
     begin = time.perf_counter()
     with stage(seconds, "prepare"):
-        source = source if isinstance(source, Prepared) else prepare(source, options.seed)
-        target = target if isinstance(target, Prepared) else prepare(target, options.seed)
+        source, target = pool.map(
+            lambda c: c if isinstance(c, Prepared) else prepare(c, options.seed), (source, target)
+        )
     best: tuple[Pair, float, list[Candidate]] | None = None
     for factor in scale_factors(source, target, options) if options.scale else (1.0,):
         scaled, given = (source, options) if factor == 1.0 else (source.scaled(factor), unscaled(options, factor))
         pair = make_pair(scaled, target, options)
+        with stage(seconds, "describe"):
+            pair.describe(pool)
         candidates = find(pair, given, seconds)
         if best is None or candidates[0].confidence > best[2][0].confidence:
             best = pair, factor, candidates
@@ -199,8 +219,8 @@ def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
         options.dof, (float(up[0]), float(up[1]), float(up[2])), float(up @ (source.centre - target.centre))
     )
     return Pair(
-        source, target, encoder(options.model, options.device), bundled_local_encoder(), motion,
-        voxel_size=options.voxel_size, normalize=options.normalize, points=options.points,
+        source, target, fast_encoder(options.model), solver(options.model, options.device), bundled_local_encoder(),
+        motion, voxel_size=options.voxel_size, normalize=options.normalize, points=options.points,
         iterations=options.iterations, robust=options.robust, seed=options.seed,
     )  # fmt: skip
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from fmr_cli.preprocess import (
     WORKING_VOXELS,
@@ -110,10 +111,28 @@ def test_patches_hold_neighbours_within_the_radius_nearest_first(scan: np.ndarra
     index = surface.keypoints(20)
     patches = surface.patches(index, 4.0, 100)
     assert {k: v.shape for k, v in patches.items()} == {
-        "offsets": (20, 100, 3), "valid": (20, 100), "normal": (20, 3), "neighbour_normals": (20, 100, 3),
+        "offsets": (20, 100, 3), "valid": (20, 100), "normal": (20, 3), "neighbours": (20, 100),
+        "normals": (len(surface.points), 3),
     }  # fmt: skip
     length = np.linalg.norm(patches["offsets"], axis=2)
     assert (length[patches["valid"] == 1] <= 1).all()
     assert (np.diff(np.where(patches["valid"] == 1, length, 2), axis=1) >= 0).all()
     brute = np.linalg.norm(surface.points - surface.points[index[0]], axis=1) < 4 * edge
     assert patches["valid"][0].sum() == min(brute.sum(), 100)
+
+
+@pytest.mark.parametrize(
+    "spread", [(1, 1, 1), (1, 1, 1e-3), (1, 1e-3, 1e-3), (1, 1, 0), (1, 0, 0), (1e-9, 1e-9, 1e-11)]
+)
+def test_the_closed_form_of_the_normals_is_that_of_lapack(spread: tuple[float, ...]) -> None:
+    points = np.random.default_rng(0).normal(size=(1000, 3)) * spread
+    tree = cKDTree(points)
+    normals, variation, *_ = normals_and_variation(points, tree)
+    near = points[tree.query(points, 16)[1]]
+    centred = near - near.mean(1, keepdims=True)
+    C = np.swapaxes(centred, 1, 2) @ centred
+    values, sums = np.linalg.eigvalsh(C), np.trace(C, axis1=1, axis2=2)
+    np.testing.assert_allclose(variation, values[:, 0] / sums, rtol=0, atol=1e-12)
+    reached = np.einsum("ni,nij,nj->n", normals, C, normals) / sums  # also where the direction is free
+    np.testing.assert_allclose(reached, values[:, 0] / sums, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-12)

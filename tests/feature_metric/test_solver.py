@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ def turns(count: int, degrees: float, shift: float = 0.0, seed: int = 0) -> Tens
 
 
 def degrees_off(g: Tensor, T: Tensor) -> Tensor:
-    return torch.rad2deg(rotation_between(g[:, :3, :3].double(), T[:, :3, :3].double()))
+    return torch.from_numpy(np.degrees(rotation_between(g[:, :3, :3].double().numpy(), T[:, :3, :3].double().numpy())))
 
 
 def identity(count: int) -> Tensor:
@@ -97,7 +98,9 @@ def test_a_constrained_motion_never_leaves_its_subgroup(
 ) -> None:
     source = se3.transform(turns(4, 20, 0.1), bodies[:4, :256])  # which no constrained motion undoes
     motion = Motion(dof, up)  # type: ignore[arg-type]
-    g = solve(encoder, make_template(encoder, bodies[:4, :256]), source, identity(4), basis=motion.basis()).g
+    g = solve(
+        encoder, make_template(encoder, bodies[:4, :256]), source, identity(4), basis=torch.from_numpy(motion.basis())
+    ).g
     axis = torch.tensor(up)
     assert (g - torch.eye(4)).abs().max() > 0.01
     assert torch.equal(g[:, :3, :3] @ axis, axis.expand(4, 3))
@@ -110,10 +113,10 @@ def test_a_constrained_motion_never_leaves_its_subgroup(
 def test_a_tilted_axis_is_kept_to_float32_rounding(encoder: Encoder, bodies: Tensor) -> None:
     up = (0.36, 0.48, 0.8)
     axis = torch.tensor(up)
-    T = Motion("yaw", up).starts(24)[1:2].float()  # 15 deg about up
+    T = torch.from_numpy(Motion("yaw", up).starts(24)[1:2]).float()  # 15 deg about up
     source = se3.transform(torch.linalg.inv(T), bodies[:1])
     template = make_template(encoder, bodies[:1])
-    g = solve(encoder, template, source, identity(1), basis=Motion("yaw", up).basis()).g
+    g = solve(encoder, template, source, identity(1), basis=torch.from_numpy(Motion("yaw", up).basis())).g
     assert (g[0, :3, :3] @ axis - axis).abs().max() < 1e-6
     assert degrees_off(g, T).item() < 0.05
 
