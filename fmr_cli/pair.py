@@ -67,7 +67,7 @@ class Prepared:
         self.points = points
         self.edge, self.spacing = working_scale(self.points, rng)
         self._surfaces: dict[float, Surface] = {}
-        self._described: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+        self._described: dict[tuple[float, int], tuple[np.ndarray, np.ndarray]] = {}
         self._fine: dict[tuple[int, float], np.ndarray] = {}
         self._gicp: dict[tuple[int, float, bool], polish.GicpCloud] = {}
 
@@ -81,14 +81,14 @@ class Prepared:
             self._surfaces[edge] = Surface(self.points, edge)
         return self._surfaces[edge]
 
-    def described(self, edge: float, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
-        if edge not in self._described:
+    def described(self, edge: float, count: int, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
+        """At most ``count`` keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
+        if (edge, count) not in self._described:
             surface = self.surface(edge)
-            index = surface.keypoints(KEYPOINTS)
+            index = surface.keypoints(count)
             patches = describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS))
-            self._described[edge] = surface.points[index], encoder(patches)
-        return self._described[edge]
+            self._described[edge, count] = surface.points[index], encoder(patches)
+        return self._described[edge, count]
 
     def fine(self, count: int, edge: float) -> np.ndarray:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
@@ -145,7 +145,8 @@ class Pair:
         local: LocalEncoder,
         motion: Motion,
         *,
-        voxel_size: float | None,
+        edge: float,
+        keypoints: int,
         normalize: bool,
         points: int,
         iterations: int,
@@ -157,7 +158,7 @@ class Pair:
         self.source, self.target, self.motion = source, target, motion
         self.encoder, self.solver, self.local = encoder, solver, local
         self.iterations, self.robust, self.seed = iterations, robust, seed
-        self.edge = voxel_size or pair_edge(source, target)
+        self.edge, self.keypoints = edge, keypoints
         self.s, self.t = source.surface(self.edge), target.surface(self.edge)
         if min(len(self.s.points), len(self.t.points)) < MIN_POINTS:
             small = source if len(self.s.points) < MIN_POINTS else target
@@ -200,12 +201,16 @@ class Pair:
     def describe(self) -> None:
         """Works out what concerns one cloud alone; both side by side where there are two threads for it."""
         with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(lambda cloud: cloud.described(self.edge, self.local), (self.source, self.target)))
+            list(pool.map(self.described, (self.source, self.target)))
+
+    def described(self, cloud: Prepared) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints of a cloud and their descriptors."""
+        return cloud.described(self.edge, self.keypoints, self.local)
 
     @cached_property
     def matches(self) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints of source and target whose descriptors match: (C, 3) each, row by row."""
-        (p, a), (q, b) = self.source.described(self.edge, self.local), self.target.described(self.edge, self.local)
+        (p, a), (q, b) = self.described(self.source), self.described(self.target)
         pairs = match(a, b)
         return p[pairs[:, 0]], q[pairs[:, 1]]
 

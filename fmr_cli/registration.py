@@ -24,13 +24,14 @@ from fmr_cli import polish, verdict
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import FmrError
 from fmr_cli.feature_metric.motion import Dof, Motion
-from fmr_cli.pair import Candidate, Pair, Prepared, Start
+from fmr_cli.pair import KEYPOINTS, Candidate, Pair, Prepared, Start, pair_edge
 from fmr_cli.weights import bundled_local_encoder, fast_encoder, solver
 
 Init = Literal["auto", "search", "features", "centroid", "identity"]
 REFINED = 3  # starts that are refined, of each kind
 SURE, RIVAL = 0.95, 0.8  # once a pose is that sure, only starts that coincide nearly as much are looked at
 SETTLED = 0.8  # once a pose is that sure, no other kind of start is tried
+COARSE, COARSE_KEYPOINTS = 1.5, 250  # a first look on larger voxels, at fewer places, which is often sure already
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
 
@@ -194,10 +195,7 @@ def _align(
     best: tuple[Pair, float, list[Candidate]] | None = None
     for factor in scale_factors(source, target, options) if options.scale else (1.0,):
         scaled, given = (source, options) if factor == 1.0 else (source.scaled(factor), unscaled(options, factor))
-        pair = make_pair(scaled, target, options, threads)
-        with stage(seconds, "describe"):
-            pair.describe()
-        candidates = find(pair, given, seconds)
+        pair, candidates = look(scaled, target, given, threads, seconds)
         if best is None or candidates[0].confidence > best[2][0].confidence:
             best = pair, factor, candidates
     assert best is not None
@@ -209,7 +207,20 @@ def _align(
     return found
 
 
-def make_pair(source: Prepared, target: Prepared, options: Options, threads: int = 1) -> Pair:
+def look(
+    source: Prepared, target: Prepared, options: Options, threads: int, seconds: dict[str, float]
+) -> tuple[Pair, list[Candidate]]:
+    """The candidates, best first, and the pair that they were found on: a coarse one where that leaves no doubt."""
+    if options.init == "auto" and options.voxel_size is None and not options.scale:
+        pair = make_pair(source, target, options, threads, coarse=True)
+        candidates = find(pair, replace(options, init="features"), seconds)
+        if candidates[0].confidence >= SURE:
+            return pair, candidates
+    pair = make_pair(source, target, options, threads)
+    return pair, find(pair, options, seconds)
+
+
+def make_pair(source: Prepared, target: Prepared, options: Options, threads: int = 1, *, coarse: bool = False) -> Pair:
     """The two clouds at their common voxel edge, with the encoders and the motions that the options ask for."""
     up = np.asarray(options.up, float)
     if not np.isfinite(up).all() or np.linalg.norm(up) == 0:
@@ -218,10 +229,11 @@ def make_pair(source: Prepared, target: Prepared, options: Options, threads: int
     motion = Motion(
         options.dof, (float(up[0]), float(up[1]), float(up[2])), float(up @ (source.centre - target.centre))
     )
+    edge = options.voxel_size or pair_edge(source, target) * (COARSE if coarse else 1.0)
     return Pair(
         source, target, fast_encoder(options.model), solver(options.model, options.device), bundled_local_encoder(),
-        motion, voxel_size=options.voxel_size, normalize=options.normalize, points=options.points,
-        iterations=options.iterations, robust=options.robust, seed=options.seed,
+        motion, edge=edge, keypoints=COARSE_KEYPOINTS if coarse else KEYPOINTS, normalize=options.normalize,
+        points=options.points, iterations=options.iterations, robust=options.robust, seed=options.seed,
         threads=threads,
     )  # fmt: skip
 
@@ -229,6 +241,8 @@ def make_pair(source: Prepared, target: Prepared, options: Options, threads: int
 def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candidate]:
     """Candidates, best first, from the starts that the options name; "auto" goes on while none is settled."""
     candidates: list[Candidate] = []
+    with stage(seconds, "describe"):
+        pair.describe()
     for name, starts in start_makers(pair, options):
         with stage(seconds, name):
             ranked = sorted(

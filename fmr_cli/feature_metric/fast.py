@@ -5,6 +5,7 @@ Same equations, same schedule, same answer; arrays are numpy's.
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -28,8 +29,12 @@ CHUNK = 256  # points; their activation of CHUNK x K stays in cache
 ROUNDING = 1e-6  # of a feature
 # Of a large source, first a few points; then those that do better in some channel; at the end all.
 LARGE, FEW = 4096, 1024
-NEAR = 0.02  # rad, and units of the normalised cloud: a step that leaves most channels to the points that have them
+NEAR, CLOSE = (
+    0.02,
+    1e-4,
+)  # rad, and units of the normalised cloud: steps that leave most, or all, channels to their points
 LAST = 5  # iterations, at least, with all points that matter
+MARGIN, SLOPE = 4e-4, 1.0  # of a channel; how fast one changes with the point, at most (0.64, most channels)
 MISSED = 1e-2  # of the mean |r|: what the channels may gain by points left out
 MORE = 2  # iterations where they gain more
 
@@ -236,17 +241,28 @@ class FastEncoder:
         """``solve`` from one start, evaluating only points that can win a channel.
 
         At first these are few, spread over the source; once a step is small, those of all points that do better than
-        the few in some channel. Whether they were all is seen at the end, at the pose found: if not, it goes on with
-        those that were missed, for at least MORE iterations. The last error is that of all points.
+        the few in some channel; once it is very small, those within MARGIN of winning, which holds until the points
+        have moved too far. Where it does not hold at the end, all points are looked at, and if some were missed, it
+        goes on with them for at least MORE iterations. The last error is that of all points.
         """
-        active, errors, near, iteration, end, size = few(source), [], False, 0, iterations, np.inf
+        corners = np.array(list(itertools.product(*np.stack([source.min(0), source.max(0)], 1))))
+        active, near, seen, missed = few(source), False, None, np.inf
+        errors, iteration, end, size = [], 0, iterations, np.inf
         while True:
             feature = self.peaks(active, g, run)[0][0]
             finished = iteration >= end or size < STOP_STEP
-            if finished or (not near and (size < NEAR or iteration >= iterations - LAST)):
-                whole, index = self.contenders(source, g[0], feature, run)
-                missed = np.mean(whole - feature)
-                active, feature, near = source[index], whole, True
+            far = (
+                np.inf
+                if seen is None
+                else np.linalg.norm(corners @ (g - seen)[0, :3, :3].T + (g - seen)[0, :3, 3], axis=1).max()
+            )
+            close = finished or (near and size < CLOSE)
+            if (close and far > MARGIN / (2 * SLOPE)) or (not near and (size < NEAR or iteration >= iterations - LAST)):
+                whole, index = self.contenders(source, g[0], feature - MARGIN * close, run)
+                missed = float(np.mean(whole - feature))
+                active, feature, near, seen = source[index], whole, True, g if close else None
+            elif finished:
+                missed = 0.0
             r = feature - template.feature
             errors.append(np.abs(r).mean())
             if finished:
