@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
-from fmr_cli.pair import Candidate, Prepared
+from fmr_cli.pair import Candidate, Prepared, pair_edge
 from fmr_cli.preprocess import cell_numbers
 from fmr_cli.registration import REFINED, Options, local_pose, make_pair
 from fmr_cli.training import scenes, shapes
@@ -33,6 +33,8 @@ from fmr_cli.training.local import degrade, scan_pair
 
 RIGHT_DEGREES, RIGHT_EDGES = 5.0, 2.0
 RIDGE = 3e-3
+# What align has looked at when it ends: the first look on coarse voxels, local features, or the search as well.
+KINDS = (("features",), ("features",), ("features", "search"))
 
 Maker = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
 
@@ -126,15 +128,16 @@ def poses(seed: tuple[int, int]) -> list[tuple[np.ndarray, bool]]:
     source, target, together = scans(rng)
     move = np.eye(4)
     move[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    kind = seed[1] % len(KINDS)
     try:
-        pair = make_pair(
-            Prepared(PointCloud(transform_points(move, source))), Prepared(PointCloud(target)), Options(seed=seed[1])
-        )
+        prepared = Prepared(PointCloud(transform_points(move, source))), Prepared(PointCloud(target))
+        pair = make_pair(*prepared, Options(seed=seed[1]), coarse=kind == 0)
     except RegistrationError:  # a street and a teacup: nothing to judge
         return []
     truth = local_pose(np.linalg.inv(move), pair)
     candidates: list[Candidate] = []
-    for starts in (pair.from_features, pair.from_search)[: 1 + (seed[1] % 2)]:  # align often ends with the first, too
+    for name in KINDS[kind]:
+        starts = getattr(pair, f"from_{name}")
         for start in sorted(starts(), key=lambda s: -pair.coincidence(s.T))[:REFINED]:
             candidate = pair.candidate(start, polished=True, scale=False)
             if not any(pair.same(candidate.T, c.T) for c in candidates):
@@ -142,7 +145,7 @@ def poses(seed: tuple[int, int]) -> list[tuple[np.ndarray, bool]]:
     found = []
     for c in candidates:
         error = np.linalg.inv(truth) @ c.T
-        near = np.linalg.norm(error[:3, 3]) < RIGHT_EDGES * pair.edge
+        near = np.linalg.norm(error[:3, 3]) < RIGHT_EDGES * pair_edge(*prepared)
         found.append((c.evidence.vector(), bool(together and near and angle_degrees(error) < RIGHT_DEGREES)))
     return found
 
@@ -217,7 +220,7 @@ def main() -> None:
     )  # fmt: skip
     data = np.load(args.out / "evidence.npz")
     x, y, pair = data["x"], data["y"], data["pair"]
-    fitted = pair % 4 < 2  # half of those with one kind of start, half of those with both
+    fitted = pair % (2 * len(KINDS)) < len(KINDS)  # half of each of the kinds
     p, right = best(x[~fitted], y[~fitted], pair[~fitted], fit(x[fitted], y[fitted], pair[fitted]))
     print(f"{len(y)} poses of {args.pairs} pairs, {y.mean():.3f} of them right; judged on the half not fitted:")
     print(report(p, right))

@@ -240,7 +240,7 @@ class Pair:
             up = np.array(self.motion.up)
             offset = up @ (self.origins[0] - self.origins[1])
             starts[:, :3, 3] = (self.motion.lift + offset) / self.length * up
-        found = search(self.solver, self.Q, self.P, starts, self.robust, self.motion.basis())
+        found = search(self.solver, self.Q, self.P, starts, self.robust, self.motion.basis(), self.threads)
         return [Start(self.restored(g), "search", e.tolist()) for g, e in zip(found.g, found.errors.T, strict=True)]
 
     def from_pose(self, T: np.ndarray, name: str) -> list[Start]:

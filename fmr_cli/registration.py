@@ -211,7 +211,8 @@ def look(
     source: Prepared, target: Prepared, options: Options, threads: int, seconds: dict[str, float]
 ) -> tuple[Pair, list[Candidate]]:
     """The candidates, best first, and the pair that they were found on: a coarse one where that leaves no doubt."""
-    if options.init == "auto" and options.voxel_size is None and not options.scale:
+    auto = isinstance(options.init, str) and options.init == "auto"
+    if auto and options.voxel_size is None and not options.scale:
         pair = make_pair(source, target, options, threads, coarse=True)
         candidates = find(pair, replace(options, init="features"), seconds)
         if candidates[0].confidence >= SURE:

@@ -29,12 +29,10 @@ CHUNK = 256  # points; their activation of CHUNK x K stays in cache
 ROUNDING = 1e-6  # of a feature
 # Of a large source, first a few points; then those that do better in some channel; at the end all.
 LARGE, FEW = 4096, 1024
-NEAR, CLOSE = (
-    0.02,
-    1e-4,
-)  # rad, and units of the normalised cloud: steps that leave most, or all, channels to their points
+NEAR, CLOSE = 0.02, 1e-4  # rad, and units of the normalised cloud: steps that leave most channels, or all, as they are
 LAST = 5  # iterations, at least, with all points that matter
-MARGIN, SLOPE = 4e-4, 1.0  # of a channel; how fast one changes with the point, at most (0.64, most channels)
+MARGIN = 4e-4  # of a channel: points this near to winning it are evaluated too
+SLOPE = 2.0  # how fast a channel changes with its point, at most (measured: 1.8)
 MISSED = 1e-2  # of the mean |r|: what the channels may gain by points left out
 MORE = 2  # iterations where they gain more
 

@@ -17,7 +17,7 @@ from fmr_cli.feature_metric.motion import rotation_between
 # 64 rotations leave none further than 60.4 deg from a start (30 on average); the solver's basin, measured, reaches 60.
 STARTS = 64
 COARSE_POINTS, COARSE_ITERATIONS = 256, 6
-KEPT, FINE_ITERATIONS = 6, 15
+KEPT, FINE_ITERATIONS = 6, 10
 APART = math.radians(10.0)  # poses nearer than this are one
 
 
