@@ -36,7 +36,7 @@ def registration_options(
     robust: Annotated[bool, option("Robust weights, or the paper's plain least squares.")] = True,
     refine: Annotated[bool, option("Finish with a geometric polish.")] = True,
     model: Annotated[Path | None, option("Encoder weights, .safetensors. [default: the bundled ones]")] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the encoder runs.")] = "auto",
+    device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the solver runs; auto: the CPU.")] = "auto",
     seed: Annotated[int, option("The same seed gives the same answer.", min=0)] = 0,
 ) -> dict[str, Any]:
     """What ``fmr_cli.Options`` takes; a transform file for ``init`` is read. Raises FmrError.

@@ -48,7 +48,7 @@ class Options:
     robust: robust weights, or the paper's plain least squares.
     refine: finish with a geometric polish (GICP).
     model: the global encoder's weights (.safetensors), or None for the bundled ones.
-    device: "auto", "cpu" or "cuda": where the global encoder runs.
+    device: "cpu", "cuda" or "auto" (the CPU): where the solver of the global feature runs.
     seed: of every random choice; the same seed gives the same answer.
     dof: "rigid", "yaw" (rotation about ``up``, any translation), "translation", "planar" (yaw, and no shift along up).
     up: the vertical, any length. scale: also estimate one scale factor.
