@@ -206,7 +206,7 @@ def write_las(path: Path, base: np.ndarray, count: int, T: np.ndarray, seed: int
 
 def las(setup: Setup) -> Rows:
     """`fmr align` on two large LAS files: seconds, peak memory, and what reading them alone takes."""
-    base = room_clouds(1, 300_000, setup.seed)[0]
+    base = room_clouds(1, min(300_000, setup.las_points), setup.seed)[0]
     T = make_pair("copy", base[:10], np.random.default_rng(setup.seed))[2]
     read = "import sys; from fmr_cli.io import read_cloud; [read_cloud(p, attributes=False) for p in sys.argv[1:]]"
     with tempfile.TemporaryDirectory() as name:
