@@ -198,6 +198,6 @@ def save(out: Path | None, report: dict[str, Any], draw: Callable[[Any], None]) 
     except ImportError as error:
         console.print(f"plot: skipped ({error})")
         return
-    figure = Figure((11, 4.2), layout="constrained")
+    figure = Figure((13, 4.6), layout="constrained")
     draw(figure)
     figure.savefig(out.with_suffix(".png"), dpi=120)

@@ -255,7 +255,7 @@ def gpu(setup: Setup) -> Rows:
     def train(encoder: Encoder, source: Any, points: Any, T: Any) -> None:
         loss = pose_loss(encoder, source, points, T, 5)
         loss.backward()
-        float(loss)
+        loss.item()
 
     rows = []
     for device in ("cpu", *(["cuda"] if torch.cuda.is_available() else [])):
@@ -285,21 +285,24 @@ PARTS: dict[str, Callable[[Setup], Rows]] = {
 
 
 def plot(figure: Any, report: dict[str, Rows]) -> None:
-    """Left: seconds of IC alone and of the whole registration; right: growth with the number of points."""
-    bars, lines = figure.subplots(1, 2)
-    shown = [r for part in ("ic", "align") for r in report.get(part, []) if not r["what"].startswith("stage")]
-    names = [r["what"] for r in shown]
-    bars.barh(names, [r["s"] for r in shown], color=["C3" if "fmr" in name else "C7" for name in names])
-    bars.set(xlabel="s", xscale="log")
-    bars.invert_yaxis()
-    bars.tick_params(labelsize="x-small")
-    grown = report.get("growth", [])
-    for method in dict.fromkeys(r["method"] for r in grown):
-        own = [r for r in grown if r["method"] == method]
-        lines.loglog([r["points"] for r in own], [r["s"] for r in own], "o-", label=method)
-    lines.set(xlabel="points", ylabel="s")
-    if grown:
-        lines.legend(fontsize="x-small")
+    """A panel each, where measured: IC alone, the whole registration, its growth with the number of points."""
+    bars = {part: report[part] for part in ("ic", "align") if part in report}
+    axes = list(figure.subplots(1, max(len(bars) + ("growth" in report), 1), squeeze=False)[0])
+    for part, rows in bars.items():
+        axis = axes.pop(0)
+        shown = [r for r in rows if not r["what"].startswith("stage")]
+        names = [r["what"].replace(": ", "\n") for r in shown]
+        axis.barh(names, [r["s"] for r in shown], color=["C3" if "fmr" in name else "C7" for name in names])
+        axis.set(title={"ic": "IC alone", "align": "registration"}[part], xlabel="s")
+        axis.invert_yaxis()
+        axis.tick_params(axis="y", labelsize="x-small")
+    if "growth" in report:
+        for method in dict.fromkeys(r["method"] for r in report["growth"]):
+            own = [r for r in report["growth"] if r["method"] == method]
+            axes[0].plot([r["points"] for r in own], [r["s"] for r in own], "o-", label=method)
+        axes[0].set(title="registration", xlabel="points", ylabel="s", xscale="log", yscale="log")
+        axes[0].yaxis.set_minor_formatter("")
+        axes[0].legend(fontsize="x-small")
 
 
 def main() -> None:
