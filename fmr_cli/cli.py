@@ -336,7 +336,8 @@ def evaluate_command(
         typer.Option(help="Weights to evaluate; again for more.", show_default="the bundled ones"),
     ] = None,
     with_baselines: Annotated[
-        bool, typer.Option("--baselines", help="LM-ICP, small_gicp, and FPFH + RANSAC, KISS-Matcher where installed.")
+        bool,
+        typer.Option("--baselines", help="PointNetLK, LM-ICP, small_gicp; FPFH + RANSAC, KISS-Matcher if installed."),
     ] = False,
     clouds: Annotated[int | None, typer.Option(help="Of each set, at most.", min=1, show_default="all")] = None,
     pairs: Annotated[int, typer.Option(help="Random pairs at each level.", min=1)] = 100,

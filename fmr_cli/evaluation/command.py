@@ -44,7 +44,7 @@ def evaluate(
         if plain:
             methods[f"{name}, plain"] = ours(weights, iterations, False)
     if with_baselines:
-        others, missing = baselines()
+        others, missing = baselines(device, iterations)
         methods |= others
         for line in missing:
             say(f"warning: {line}")

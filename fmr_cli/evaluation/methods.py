@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
+from importlib.resources import as_file, files
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from fmr_cli.evaluation.heldout import register
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.training.data import Pairs
+from fmr_cli.weights import Device, encoder
 
 Method = Callable[[Pairs], Tensor]
 
@@ -23,9 +25,9 @@ REACH = 0.2  # farthest correspondence of GICP, as wide as a pose it can still p
 LM_EVALUATIONS = 100
 
 
-def ours(encoder: Encoder, iterations: int, robust: bool) -> Method:
+def ours(weights: Encoder, iterations: int, robust: bool) -> Method:
     """The IC solver from the identity: one start, no search, no geometric polish."""
-    return lambda pairs: register(encoder, pairs, iterations, robust)
+    return lambda pairs: register(weights, pairs, iterations, robust)
 
 
 def one_by_one(solve: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Method:
@@ -97,13 +99,20 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return T
 
 
-def baselines() -> tuple[dict[str, Method], list[str]]:
-    """The baselines whose libraries are installed, and a line for each that is not."""
+def pointnetlk(device: Device, iterations: int) -> Method:
+    """The same IC with plain steps and an encoder trained on the pose loss alone, by models/pointnetlk.toml."""
+    with as_file(files("fmr_cli.models") / "pointnetlk.safetensors") as path:
+        return ours(encoder(path, device), iterations, robust=False)
+
+
+def baselines(device: Device, iterations: int) -> tuple[dict[str, Method], list[str]]:
+    """PointNetLK, the baselines whose libraries are installed, and a line for each that is not."""
     known = {
         "LM-ICP": (lm_icp, "scipy"),
         "small_gicp": (gicp, "small_gicp"),
         "FPFH + RANSAC": (fpfh_ransac, "open3d"),
         "KISS-Matcher": (kiss_matcher, "kiss_matcher"),
     }
-    there = {name: one_by_one(f) for name, (f, package) in known.items() if importlib.util.find_spec(package)}
+    there = {"PointNetLK": pointnetlk(device, iterations)}
+    there |= {name: one_by_one(f) for name, (f, package) in known.items() if importlib.util.find_spec(package)}
     return there, [f"no {name}: {p} is not installed" for name, (_, p) in known.items() if name not in there]

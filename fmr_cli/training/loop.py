@@ -13,7 +13,7 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ from fmr_cli.evaluation.heldout import HARD, score
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder, load_weights, save_encoder
 from fmr_cli.io.files import atomic_write
-from fmr_cli.training.data import draw_clouds, draw_pairs, make_pairs, random_motions, random_rotations
-from fmr_cli.training.losses import feature, pose_loss
+from fmr_cli.training.data import Augment, Pairs, draw_clouds, draw_pairs, make_pairs, random_motions, random_rotations
+from fmr_cli.training.losses import encode, pose_loss
 from fmr_cli.training.recipe import Recipe, read_recipe
 
 RAMP = 100  # steps over which the learning rate rises from zero
@@ -129,26 +129,27 @@ class Trainer:
             clouds = draw_clouds(self.data.train, recipe.chamfer_batch, generator)
             seen, whole = clouds[:, : recipe.points], clouds[:, -recipe.points :]
             with torch.set_grad_enabled(step >= self.warmup):
-                code = feature(self.encoder, seen)[0]
+                code = encode(self.encoder, seen).feature
             losses["chamfer"] = recipe.chamfer_weight * chamfer(self.decoder(code), whole).mean()
         if recipe.pose_weight > 0 and step >= self.warmup and share >= recipe.pose_after:
-            pairs = self.draw(generator)
-            error = pose_loss(self.encoder, pairs.source, pairs.target, pairs.truth, recipe.unroll, recipe.robust)
+            plain = float(torch.rand((), generator=generator, device=self.device)) < recipe.plain
+            full = replace(recipe.augment, rotation=recipe.plain_rotation, overlap=1.0)
+            pairs = self.draw(full if plain else recipe.augment, generator)
+            error = pose_loss(self.encoder, pairs.source, pairs.target, pairs.truth, recipe.unroll, not plain)
             losses["pose"] = recipe.pose_weight * error
         return losses
 
-    def draw(self, generator: torch.Generator) -> Any:
+    def draw(self, augment: Augment, generator: torch.Generator) -> Pairs:
         """The pairs of a step: synthetic ones, and every other step labelled ones where there are any."""
         recipe = self.recipe
         if self.data.pairs is None or float(torch.rand((), generator=generator, device=self.device)) < 0.5:
-            return draw_pairs(self.data.train, recipe.pose_batch, recipe.points, recipe.augment, generator)
+            return draw_pairs(self.data.train, recipe.pose_batch, recipe.points, augment, generator)
         sources, targets = self.data.pairs
         index = torch.randint(len(sources), (recipe.pose_batch,), generator=generator, device=self.device)
         turn = random_rotations(recipe.pose_batch, generator)
         order = torch.rand(sources.shape[1], generator=generator, device=self.device).argsort()[: recipe.points]
         source, target = ((x[index][:, order] @ turn) for x in (sources, targets))
         spread = torch.rand(3, recipe.pose_batch, generator=generator, device=self.device)
-        augment = recipe.augment
         truth = random_motions(augment.rotation * spread[0], augment.shift * spread[1], generator)
         sigma = augment.noise * spread[2].square()
         return make_pairs(source, target, truth, sigma, augment.centre, 0 * sigma, generator)

@@ -1,38 +1,84 @@
 """The two losses of the paper: Chamfer through the decoder (no label needed), and the point error of the unrolled IC.
 
 Both reach the encoder through the critical points alone. Which points those are is found without a gradient and in
-bfloat16, which is faster; their values are exact.
+bfloat16, which is faster; their values are exact, and each such point goes through the network once.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
-from fmr_cli.feature_metric.encoder import Encoder, jacobian
+from fmr_cli.feature_metric.encoder import Encoder, chain
 from fmr_cli.feature_metric.solver import SCALE_FROM, SCALE_TO, geman_mcclure
 
 DAMPING = 1e-4  # of the mean diagonal of JᵀWJ: keeps an early, badly determined step from blowing up the gradient
-CLIP = 1.0  # largest point error that still pulls, in units of the normalised cloud
+NEAR = 0.05  # point error, in units of the normalised cloud, from which on its logarithm counts
 
 
-def feature(encoder: Encoder, points: Tensor) -> tuple[Tensor, Tensor]:
-    """F with a gradient, and the critical points: (B, N, 3) -> feature (B, K), index (B, K)."""
-    x = points
+@dataclass
+class Code:
+    """F of a batch of clouds with a gradient, through its critical points alone.
+
+    feature: (B, K); points: (U, 3), each critical point of the batch once; at: (B, K) which of them sets each channel.
+    """
+
+    feature: Tensor
+    points: Tensor
+    at: Tensor
+
+
+@torch.no_grad()
+def critical_index(encoder: Encoder, points: Tensor) -> Tensor:
+    """(B, K) the point of each cloud (B, N, 3) that sets each channel, within the rounding of bfloat16.
+
+    A bfloat16 leaves 16 bits of a float32 free: they take the point's number, so that one plain maximum finds value and
+    place at once (twice as fast as max with indices), cloud by cloud, which keeps the activation in cache.
+    """
+    number = torch.arange(points.shape[1], dtype=torch.int32, device=points.device)[:, None]
+    with torch.autocast(points.device.type, torch.bfloat16):
+        x = points
+        for layer in encoder.layers[:-1]:
+            x = torch.relu(layer(x))
+        found = []
+        for cloud in x.bfloat16().split(1 if points.device.type == "cpu" else len(x)):
+            value = torch.nn.functional.linear(cloud, encoder.linear[-1].weight).float()
+            value.view(torch.int32).bitwise_or_(number)
+            found.append(value.amax(1).view(torch.int32) & 0xFFFF)
+    return torch.cat(found).long().clamp_max(points.shape[1] - 1)  # of a NaN, any: the loss says so
+
+
+def encode(encoder: Encoder, points: Tensor) -> Code:
+    """F of clouds (B, N, 3)."""
+    count, size = points.shape[:2]
+    flat = critical_index(encoder, points) + size * torch.arange(count, device=points.device)[:, None]
+    used = torch.zeros(count * size, dtype=torch.bool, device=points.device)
+    used[flat] = True
+    at = (used.cumsum(0) - 1)[flat]
+    critical = points.reshape(-1, 3)[used]
+    x = critical
     for layer in encoder.layers[:-1]:
         x = torch.relu(layer(x))
+    rows = torch.nn.functional.embedding(at, x)  # [B x K x width]
     weight, bias = encoder.layers[-1].parameters()
-    with torch.no_grad(), torch.autocast(points.device.type, torch.bfloat16):
-        index = torch.nn.functional.linear(x, weight).max(1).indices  # [B x K]; faster on the CPU than argmax
-    at = x.gather(1, index[..., None].expand(-1, -1, x.shape[-1]))  # [B x K x width]
-    return torch.einsum("bkw,kw->bk", at, weight) + bias, index
+    return Code(torch.einsum("bkw,kw->bk", rows, weight) + bias, critical, at)
+
+
+def jacobian(encoder: Encoder, code: Code) -> Tensor:
+    """J of F(exp(-xi) P) at xi = 0 with a gradient, (B, K, 6), as ``encoder.jacobian``."""
+    on = [torch.nn.functional.embedding(code.at, mask.float()) for mask in encoder.active(code.points)]
+    gradient = chain(encoder.linear, on)
+    p = code.points[code.at]
+    return -torch.cat([torch.linalg.cross(p, gradient), gradient], -1)
 
 
 def autoencoder_loss(encoder: Encoder, decoder: Decoder, points: Tensor, whole: Tensor) -> Tensor:
     """Chamfer distance of what the decoder makes of F(points) to ``whole``, another sample of the same surface."""
-    return chamfer(decoder(feature(encoder, points)[0]), whole).mean()
+    return chamfer(decoder(encode(encoder, points).feature), whole).mean()
 
 
 def pose_loss(
@@ -40,19 +86,19 @@ def pose_loss(
 ) -> Tensor:
     """Point error of the unrolled IC: source, target (B, N, 3), truth T_target_source (B, 4, 4).
 
-    The mean distance of g Q to truth Q after each iteration, averaged over the iterations: a start far off is pulled
-    too, not only the last step.
+    The mean over pairs of log(1 + d / NEAR), d the RMS distance of g Q to truth Q, after each iteration; the i-th
+    counts i-fold. The logarithm lets a pair that is nearly right pull as much as one that is lost.
     """
     wanted = se3.transform(truth, source)
-    aim, index = feature(encoder, target)
-    J = jacobian(encoder, target, index)
+    aim = encode(encoder, target)
+    J = jacobian(encoder, aim)
     g = torch.eye(4, device=source.device).expand(len(source), 4, 4)
     loss = source.new_zeros(())
     for iteration in range(iterations):
         moved = se3.transform(g, source)
-        r = feature(encoder, moved)[0] - aim
+        r = encode(encoder, moved).feature - aim.feature
         fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * iteration / max(iterations - 1, 1)
-        weight = geman_mcclure(r, fall).detach() if robust else torch.ones_like(r)
+        weight = geman_mcclure(r, fall) if robust else torch.ones_like(r)
         WJ = weight[..., None] * J
         A, b = J.mT @ WJ, WJ.mT @ r[..., None]
         damping = DAMPING * A.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * torch.eye(6, device=A.device)
@@ -60,5 +106,5 @@ def pose_loss(
         step = step / step.norm(dim=-1, keepdim=True).clamp_min(1.0)  # the solver's cap of one radian
         g = se3.exp(step) @ g
         distance = (se3.transform(g, source) - wanted).square().sum(-1).mean(-1).clamp_min(1e-12).sqrt()
-        loss = loss + distance.clamp_max(CLIP).mean() / iterations
-    return loss
+        loss = loss + (iteration + 1) * torch.log1p(distance / NEAR).mean()
+    return 2 * loss / (iterations * (iterations + 1))

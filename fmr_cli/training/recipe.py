@@ -24,6 +24,7 @@ class Recipe:
     feature_dim: int = 1024  # from scratch only; otherwise the start's
     hidden: tuple[int, ...] = (64, 64, 64, 128)
     shapes: int = 0  # procedural shapes; 0 for the scans on the command line
+    scenes: int = 0  # procedural rooms, streets and things, each scanned once and cut into SCENE_CROPS clouds
     crops: int = 4096  # at most, cut from the scans
     cloud_points: int = 2048  # kept of every shape or crop
     points: int = 512  # of each cloud in a step
@@ -34,7 +35,8 @@ class Recipe:
     pose_after: float = 0.0  # share of the steps before the pose loss sets in
     chamfer_until: float = 1.0  # share of the steps after which the Chamfer loss stops
     unroll: int = 5  # IC iterations that the pose loss goes through
-    robust: bool = True  # Geman-McClure weights in the unrolled iterations
+    plain: float = 0.0  # share of the pose steps without robust weights, on pairs that overlap fully
+    plain_rotation: float = 90.0  # degrees at most, in those steps
     decoder_warmup: int = 200  # steps for a new decoder alone, where the encoder is already trained
     learning_rate: float = 3e-4
     clip: float = 1.0  # largest norm of the gradient
@@ -58,6 +60,8 @@ class Recipe:
             raise RecipeError(f"the recipe has {wrong[0]}; give a larger number")
         if self.epoch_steps < 1 or self.held_out_pairs < 1 or not 0 < self.held_out < 1:
             raise RecipeError("the recipe needs epoch_steps and held_out_pairs of 1 or more, held_out between 0 and 1")
+        if self.plain > 1:
+            raise RecipeError("the recipe needs a plain of 1 at most, a share of the pose steps")
         if not 0 < self.augment.overlap <= 1 or not 0 < self.augment.density <= 1:
             raise RecipeError("the recipe's overlap and density must be above 0 and at most 1")
         if self.chamfer_weight == 0 and self.pose_weight == 0:

@@ -26,7 +26,7 @@ from fmr_cli.training.loop import (
     success_table,
 )
 from fmr_cli.training.recipe import Recipe, read_recipe
-from fmr_cli.training.scans import find_scans, load_material, load_pairs
+from fmr_cli.training.scans import find_scans, load_material, load_pairs, scene_crops
 from fmr_cli.training.shapes import shapes
 from fmr_cli.weights import Device, pick_device
 
@@ -111,6 +111,13 @@ def read_data(
         train.append(clouds[count:])
         held_out.append(clouds[:count])
         described.append(f"{len(clouds) - count} procedural shapes, {count} held out")
+    if recipe.scenes:
+        cut = scene_crops(recipe.scenes, recipe.cloud_points, recipe.seed, progress)
+        count = held_out_count(recipe.scenes, recipe)
+        train += cut[count:]
+        held_out += cut[:count]
+        crops = sum(map(len, cut[count:]))
+        described.append(f"{crops} crops of {len(cut) - count} scans of procedural scenes, {count} scans held out")
     if scans:
         material = load_material(find_scans(scans), recipe.crops, recipe.cloud_points, recipe.seed, progress)
         warnings += material.skipped
@@ -142,10 +149,10 @@ def read_data(
 
 
 def held_out_count(clouds: int, recipe: Recipe) -> int:
-    """How many procedural shapes are held out. Raises FmrError where too few are left on either side."""
+    """How many procedural shapes or scenes are held out. Raises FmrError where too few are left on either side."""
     count = max(round(recipe.held_out * clouds), LEAST_HELD_OUT)
     if count >= clouds:
-        raise TrainingError(f"shapes = {clouds} is too few to hold {count} out; give a larger number")
+        raise TrainingError(f"{clouds} shapes or scenes are too few to hold {count} out; give a larger number")
     return count
 
 

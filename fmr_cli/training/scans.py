@@ -13,12 +13,14 @@ from fmr_cli.cloud import transform_points
 from fmr_cli.errors import FmrError
 from fmr_cli.io import SUFFIXES, read_cloud, read_transform
 from fmr_cli.preprocess import sample, voxel_downsample
+from fmr_cli.training import scenes
 
 TABLES = (".txt", ".csv", ".npy", ".npz")  # also poses, calibrations, time stamps
 CROPS_OF_A_SCAN = 24
 SMALLEST = 256  # points of a crop on its grid
 RADII = (0.25, 1.0)  # of a crop, as shares of the distance that 90 % of the scan's points lie within
 GRID = 30  # voxel edges in a crop's radius: evens out a LiDAR's rings, keeps some thousand points
+SCENE_CROPS = 12
 TRIES = 3  # crops drawn for each that is wanted
 
 
@@ -106,6 +108,33 @@ def crops_of(points: np.ndarray, count: int, cloud_points: int, rng: np.random.G
         if len(thin) < SMALLEST:
             thin = inside  # a sparse scan: its own points, as they are
         found.append(to_size(thin, cloud_points, rng))
+    return found
+
+
+def scene_scan(rng: np.random.Generator) -> np.ndarray:
+    """A scan (n, 3) of a fresh procedural scene: half of them rooms, a quarter streets, a quarter things."""
+    kind = rng.random()
+    if kind < 0.5:
+        eye = np.array([*rng.normal(0, 0.7, 2), rng.uniform(1, 1.8)])
+        return scenes.room_scan(scenes.room(rng), rng, eye, rng.uniform(0, 2 * np.pi), int(rng.integers(1, 8)))
+    if kind < 0.75:
+        return scenes.street_scan(scenes.street(rng), rng, np.array([rng.uniform(-40, 40), rng.uniform(-2, 2), 1.8]))
+    return scenes.thing_scan(scenes.thing(rng), rng, rng.normal(size=3), int(rng.integers(1, 8)))
+
+
+def scene_crops(
+    count: int, cloud_points: int, seed: int, progress: Callable[[int, int], None] = lambda i, n: None
+) -> list[np.ndarray]:
+    """``count`` scans of procedural scenes, each as its crops (SCENE_CROPS at most, cloud_points, 3)."""
+    found: list[np.ndarray] = []
+    attempt = 0
+    while len(found) < count:
+        progress(len(found), count)
+        rng = np.random.default_rng((seed, attempt))
+        attempt += 1
+        points = scene_scan(rng)
+        if len(points) >= SMALLEST and (cut := crops_of(points, SCENE_CROPS, cloud_points, rng)):
+            found.append(np.stack(cut))
     return found
 
 

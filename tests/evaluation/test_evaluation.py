@@ -8,7 +8,7 @@ import torch
 
 from fmr_cli.evaluation.experiments import EXPERIMENTS, Clouds, feature_maps, run
 from fmr_cli.evaluation.heldout import Setting, draw, errors
-from fmr_cli.evaluation.methods import gicp, lm_icp, one_by_one, ours
+from fmr_cli.evaluation.methods import baselines, gicp, lm_icp, one_by_one, ours
 from fmr_cli.feature_metric import se3
 from fmr_cli.training.shapes import others
 from fmr_cli.weights import bundled_encoder
@@ -50,6 +50,14 @@ def test_baselines_find_a_small_motion(clouds, baseline):
     pairs = draw(clouds.points, Setting("", (5, 5), resample=False), 4, 512, seed=0)
     found = errors(one_by_one(baseline)(pairs), pairs.truth)
     assert np.median(found.rotation) < 1
+
+
+def test_the_baselines_have_a_pointnetlk_with_weights_of_its_own(clouds):
+    methods, missing = baselines("cpu", 10)
+    assert "LM-ICP" in methods
+    assert all("is not installed" in line for line in missing)
+    pairs = draw(clouds.points, Setting("", (20, 20), resample=False), 12, 512, seed=0)
+    assert errors(methods["PointNetLK"](pairs), pairs.truth).success > 0.8
 
 
 @pytest.mark.parametrize("robust", [True, False])

@@ -7,8 +7,9 @@ import torch
 
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.encoder import jacobian as exact_jacobian
 from fmr_cli.training.data import Augment, draw_pairs
-from fmr_cli.training.losses import autoencoder_loss, feature, pose_loss
+from fmr_cli.training.losses import autoencoder_loss, critical_index, encode, jacobian, pose_loss
 from fmr_cli.training.shapes import shapes
 
 
@@ -43,7 +44,12 @@ def test_chamfer_has_the_gradient_of_the_plain_formula(clouds):
 
 def test_the_training_feature_is_the_encoders(encoder, clouds):
     # The critical points are picked in bfloat16: another point may be taken, of nearly the same value.
-    assert torch.allclose(feature(encoder, clouds)[0], encoder(clouds), atol=0.02)
+    assert torch.allclose(encode(encoder, clouds).feature, encoder(clouds), atol=0.02)
+
+
+def test_the_training_jacobian_is_the_exact_one_of_its_critical_points(encoder, clouds):
+    expected = exact_jacobian(encoder, clouds, critical_index(encoder, clouds))
+    assert torch.allclose(jacobian(encoder, encode(encoder, clouds)), expected, atol=1e-5)
 
 
 def test_the_autoencoder_loss_reaches_encoder_and_decoder(encoder, clouds):

@@ -7,7 +7,7 @@ import pytest
 
 from fmr_cli import PointCloud, write_cloud
 from fmr_cli.errors import FmrError
-from fmr_cli.training.scans import find_scans, load_material, load_pairs
+from fmr_cli.training.scans import SCENE_CROPS, find_scans, load_material, load_pairs, scene_crops
 from fmr_cli.training.shapes import others
 
 
@@ -41,6 +41,13 @@ def test_a_large_scan_is_cut_into_crops_of_several_scales(scan):
     assert abs(material.clouds).max((1, 2)) == pytest.approx(0.5)
     spreads = material.clouds.std((1, 2))
     assert spreads.std() > 0.005  # not the same cloud twelve times
+
+
+def test_procedural_scenes_are_cut_up_like_scans_and_the_same_every_time():
+    found = scene_crops(3, cloud_points=256, seed=5)
+    assert len(found) == 3
+    assert all(1 <= len(cut) <= SCENE_CROPS and cut.shape[1:] == (256, 3) for cut in found)
+    assert all((a == b).all() for a, b in zip(found, scene_crops(3, cloud_points=256, seed=5), strict=True))
 
 
 def test_unreadable_and_small_scans_are_skipped_and_said(tmp_path, scan):
