@@ -58,7 +58,7 @@ def test_every_iteration_s_error_is_kept_and_the_end_is_early(encoder: Encoder, 
     assert torch.equal(solve(encoder, template, source, T, iterations=0).g, T)
 
 
-def test_robust_weights_bear_missing_parts_that_plain_least_squares_does_not(encoder: Encoder) -> None:
+def test_missing_parts_pull_robust_weights_off_less_than_plain_least_squares(encoder: Encoder) -> None:
     clouds = torch.from_numpy(shapes(16, 1024, seed=30_000))
     side = torch.randn(16, 3, 1, generator=torch.Generator().manual_seed(5))
     order = (clouds @ side)[..., 0].argsort(1)[..., None].expand(-1, -1, 3)
@@ -68,8 +68,7 @@ def test_robust_weights_bear_missing_parts_that_plain_least_squares_does_not(enc
     source, template = se3.transform(torch.linalg.inv(T), second[:, ::2]), make_template(encoder, first[:, 1::2])
     robust, plain = (degrees_off(solve(encoder, template, source, identity(16), 10, r).g, T) for r in (True, False))
     assert (robust < 5).float().mean() >= 0.8
-    assert (robust < 5).sum() > (plain < 5).sum()
-    assert robust.median() < plain.median()
+    assert robust.median() < 0.6 * plain.median()
 
 
 def test_what_a_point_or_a_line_does_not_determine_shows_in_the_rank_and_stays(encoder: Encoder) -> None:
