@@ -16,8 +16,9 @@ from fmr_cli.feature_metric.motion import rotation_between
 
 # 64 rotations leave none further than 60.4 deg from a start (30 on average); the solver's basin, measured, reaches 60.
 STARTS = 64
-COARSE_POINTS, COARSE_ITERATIONS = 256, 6
-KEPT, FINE_ITERATIONS = 6, 10
+# (points, iterations, distinct poses kept) of each round; the last takes all points.
+ROUNDS = ((128, 4, 16), (256, 5, 6), (None, 10, 6))
+KEPT = ROUNDS[-1][2]
 APART = math.radians(10.0)  # poses nearer than this are one
 
 
@@ -60,16 +61,15 @@ def search(
 ) -> Found:
     """Solve from every start (S, 4, 4); source (N, 3), target (M, 3) normalised, points in random order.
 
-    The coarse round uses the first COARSE_POINTS of both; the best KEPT are refined on all points.
+    The first rounds use the first points of both; what ends with a large error goes no further.
     """
-    template = solver.template(target[:COARSE_POINTS], threads)
-    coarse = solver.solve(template, source[:COARSE_POINTS], starts, COARSE_ITERATIONS, robust, basis, threads)
-    best = distinct(coarse.g, coarse.error, KEPT)
-    fine = solver.solve(
-        solver.template(target, threads), source, coarse.g[best], FINE_ITERATIONS, robust, basis, threads
-    )
-    order = distinct(fine.g, fine.error, KEPT)
-    return Found(fine.g[order], fine.error[order], fine.errors[:, order])
+    g = starts
+    for points, iterations, kept in ROUNDS:
+        template = solver.template(target[:points], threads)
+        found = solver.solve(template, source[:points], g, iterations, robust, basis, threads)
+        order = distinct(found.g, found.error, kept)
+        g = found.g[order]
+    return Found(g, found.error[order], found.errors[:, order])
 
 
 def distinct(g: np.ndarray, error: np.ndarray, count: int) -> list[int]:
