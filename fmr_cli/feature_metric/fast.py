@@ -32,7 +32,7 @@ LARGE, FEW = 4096, 1024
 NEAR, CLOSE = 0.02, 1e-4  # rad, and units of the normalised cloud: steps that leave most channels, or all, as they are
 LAST = 5  # iterations, at least, with all points that matter
 MARGIN = 4e-4  # of a channel: points this near to winning it are evaluated too
-SLOPE = 2.0  # how fast a channel changes with its point, at most (measured: 1.8)
+STEEPEST = 2.0  # times the steepest critical point of a target: no channel changes faster with its point (measured)
 MISSED = 1e-2  # of the mean |r|: what the channels may gain by points left out
 MORE = 2  # iterations where they gain more
 
@@ -244,6 +244,8 @@ class FastEncoder:
         goes on with them for at least MORE iterations. The last error is that of all points.
         """
         corners = np.array(list(itertools.product(*np.stack([source.min(0), source.max(0)], 1))))
+        slope = STEEPEST * np.linalg.norm(template.J[:, 3:], axis=1).max()
+        allowed = MARGIN / max(2 * slope, 1e-12)  # motion, before a point that was left out could win
         active, near, seen, missed = few(source), False, None, np.inf
         errors, iteration, end, size = [], 0, iterations, np.inf
         while True:
@@ -255,7 +257,7 @@ class FastEncoder:
                 else np.linalg.norm(corners @ (g - seen)[0, :3, :3].T + (g - seen)[0, :3, 3], axis=1).max()
             )
             close = finished or (near and size < CLOSE)
-            if (close and far > MARGIN / (2 * SLOPE)) or (not near and (size < NEAR or iteration >= iterations - LAST)):
+            if (close and far > allowed) or (not near and (size < NEAR or iteration >= iterations - LAST)):
                 whole, index = self.contenders(source, g[0], feature - MARGIN * close, run)
                 missed = float(np.mean(whole - feature))
                 active, feature, near, seen = source[index], whole, True, g if close else None
