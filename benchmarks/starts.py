@@ -107,12 +107,9 @@ def main() -> None:
     ways = starts()
     rows: dict[str, list[tuple[bool, bool, float]]] = {name: [] for name in ways}
     for source, target, truth in problems:
-        prepared = Prepared(PointCloud(source)), Prepared(PointCloud(target))
-        for name, way in ways.items():
-            pair = make_pair(*prepared, Options())
+        for name, way in ways.items():  # each prepares the clouds anew, and so pays for its own features
+            pair = make_pair(Prepared(PointCloud(source)), Prepared(PointCloud(target)), Options())
             T = local_pose(truth, pair)
-            for side in prepared:  # so that every way pays for its own features
-                side._described.clear()
             begin = time.perf_counter()
             found = way(pair)
             took = time.perf_counter() - begin

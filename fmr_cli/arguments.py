@@ -36,12 +36,12 @@ def registration_options(
     robust: Annotated[bool, option("Robust weights, or the paper's plain least squares.")] = True,
     refine: Annotated[bool, option("Finish with a geometric polish.")] = True,
     model: Annotated[Path | None, option("Encoder weights, .safetensors. [default: the bundled ones]")] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the encoder runs.")] = "auto",
+    device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the solver runs; auto: the CPU.")] = "auto",
     seed: Annotated[int, option("The same seed gives the same answer.", min=0)] = 0,
 ) -> dict[str, Any]:
     """What ``fmr_cli.Options`` takes; a transform file for ``init`` is read. Raises FmrError.
 
-    As a dict, since importing Options imports torch, which should not come before the first look at the files.
+    As a dict, since Options comes with scipy, which should not come before the first look at the files.
     """
     return {
         "init": read_init(init), "voxel_size": voxel_size, "normalize": normalize, "points": points, "dof": dof,

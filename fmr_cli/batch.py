@@ -206,7 +206,7 @@ class Batch:
         try:
             init = {"init": read_init(pair.init, self.folder)} if pair.init else {}
             source, target = self.clouds.get(self.folder / pair.source), self.clouds.get(self.folder / pair.target)
-            found = align(source.prepared, target.prepared, replace(self.options, **init))
+            found = align(source.prepared, target.prepared, replace(self.options, **init), threads=1)
             warnings = [*found.warnings, *self.write_clouds(pair, source.cloud, target.cloud, found.T_target_source)]
             write_transform(self.out / "transforms" / f"{pair.name}.txt", found.T_target_source)
             row |= {

@@ -64,7 +64,7 @@ def align_command(
     with busy(f"registering {source.name} onto {target.name}", quiet):
         moving = io.read_cloud(source, attributes=bool(aligned or merged))
         fixed = io.read_cloud(target, attributes=bool(merged))
-        with quick_imports():  # after reading: a bad file is said at once, before torch is in
+        with quick_imports():  # after reading: a bad file is said at once
             from fmr_cli.registration import Options, align
         found = align(moving, fixed, Options(**options))
     T, said, warnings = found.T_target_source, outputs.metrics(moving, fixed, found), [*found.warnings]
@@ -386,6 +386,7 @@ def complain(error: Exception) -> None:
 
 def main() -> None:
     """Run the command; an FmrError or OSError becomes one line on stderr and exit code 2."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's products are small here; its threads only wait
     try:
         app()
     except (FmrError, OSError) as error:

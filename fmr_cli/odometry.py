@@ -66,7 +66,7 @@ class Scan:
     @cached_property
     def prepared(self) -> Any:
         """For the feature-metric registration, which encodes a scan once."""
-        from fmr_cli.registration import prepare  # brings torch, which few sequences need
+        from fmr_cli.registration import prepare  # few sequences need it
 
         return prepare(PointCloud(self.points))
 

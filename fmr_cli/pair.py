@@ -6,35 +6,32 @@ order and translates to the files' coordinates.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from fmr_cli import polish, verdict
 from fmr_cli.cloud import PointCloud, angle_degrees
 from fmr_cli.errors import RegistrationError
 from fmr_cli.feature_metric.consensus import consensus, match
-from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.fast import FastEncoder, Template
 from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
 from fmr_cli.feature_metric.motion import Motion, rotations
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
-from fmr_cli.feature_metric.search import STARTS, search
-from fmr_cli.feature_metric.solver import Template, make_template, solve
-from fmr_cli.preprocess import Surface, distinct, sample, voxel_downsample, working_scale
+from fmr_cli.feature_metric.search import STARTS, Solver, search
+from fmr_cli.preprocess import Surface, distinct, sample, thinned, voxel_downsample, working_scale
 
 MIN_POINTS = 10
+AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more in every voxel
 KEYPOINTS = 500
 CONSENSUS_TOLERANCE = 2.0  # voxel edges
 CONSENSUS_POSES = 5
 RANKING_POINTS = 800
 LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; the polish does the rest
-FINE = LEVELS[
-    1:
-]  # enough from matched features, which are within CONSENSUS_TOLERANCE; its residual goes to the verdict
+FINE = LEVELS[1:]
 DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one
 CHANCE_POSES = 8
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
@@ -49,12 +46,15 @@ LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
 class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once.
 
-    points: (N, 3) float64 about ``centre`` (the mean), finite and distinct. edge: the voxel edge that suits this cloud;
-    spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one place.
+    points: (N, 3) float64 about ``centre`` (their mean), at most AT_MOST, finite and distinct. edge: the voxel edge
+    that suits this cloud; spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one
+    place.
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
-        points = cloud.points[np.isfinite(cloud.points).all(1)]
+        rng = np.random.default_rng(seed)
+        points = thinned(cloud.points, AT_MOST, rng)
+        points = points[np.isfinite(points).all(1)]
         self.centre = points.mean(0) if len(points) else np.zeros(3)
         points = distinct(points - self.centre)
         if len(points) == 1 and len(cloud) > 1:
@@ -65,9 +65,9 @@ class Prepared:
             )
         self.name, self.read, self.seed = cloud.name, len(cloud), seed
         self.points = points
-        self.edge, self.spacing = working_scale(self.points, np.random.default_rng(seed))
+        self.edge, self.spacing = working_scale(self.points, rng)
         self._surfaces: dict[float, Surface] = {}
-        self._described: dict[float, tuple[np.ndarray, Tensor]] = {}
+        self._described: dict[tuple[float, int], tuple[np.ndarray, np.ndarray]] = {}
         self._fine: dict[tuple[int, float], np.ndarray] = {}
         self._gicp: dict[tuple[int, float, bool], polish.GicpCloud] = {}
 
@@ -81,16 +81,14 @@ class Prepared:
             self._surfaces[edge] = Surface(self.points, edge)
         return self._surfaces[edge]
 
-    def described(self, edge: float, encoder: LocalEncoder) -> tuple[np.ndarray, Tensor]:
-        """Keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
-        if edge not in self._described:
+    def described(self, edge: float, count: int, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
+        """At most ``count`` keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
+        if (edge, count) not in self._described:
             surface = self.surface(edge)
-            index = surface.keypoints(KEYPOINTS)
-            patches = surface.patches(index, PATCH_RADIUS, NEIGHBOURS)
-            with torch.inference_mode():
-                found = encoder(describe_patches(**{k: torch.from_numpy(v) for k, v in patches.items()}))
-            self._described[edge] = surface.points[index], found
-        return self._described[edge]
+            index = surface.keypoints(count)
+            patches = describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS))
+            self._described[edge, count] = surface.points[index], encoder(patches)
+        return self._described[edge, count]
 
     def fine(self, count: int, edge: float) -> np.ndarray:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
@@ -99,27 +97,31 @@ class Prepared:
             self._fine[count, edge] = sample(points, count, np.random.default_rng(self.seed))
         return self._fine[count, edge]
 
-    def for_gicp(self, count: int, edge: float, own: bool = False) -> polish.GicpCloud:
+    def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> polish.GicpCloud:
         """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""
         if (count, edge, own) not in self._gicp:
             rng = np.random.default_rng(self.seed)
             points = sample(self.points, count, rng) if own else self.fine(count, edge)
-            self._gicp[count, edge, own] = polish.GicpCloud(points, edge)
+            self._gicp[count, edge, own] = polish.GicpCloud(points, edge, threads)
         return self._gicp[count, edge, own]
 
 
 @dataclass
 class Candidate:
-    """A pose with what speaks for it. start: where it came from; errors: mean |r| of the IC solver that led to it."""
+    """A pose with what speaks for it. start: where it came from; errors: mean |r| of the IC solver that led to it.
+
+    confidence: that it is right, given the other candidates; set once these are known.
+    """
 
     T: np.ndarray
     start: str
     errors: list[float]
     evidence: verdict.Evidence
+    confidence: float = 0.0
 
-    @property
-    def confidence(self) -> float:
-        return verdict.confidence(self.evidence)
+    @cached_property
+    def odds(self) -> float:
+        return verdict.odds(self.evidence)
 
 
 @dataclass
@@ -132,26 +134,31 @@ class Start:
 
 
 class Pair:
-    """Two clouds at one voxel edge. encoder: F; local: of the patch features; motion: what is allowed."""
+    """Two clouds at one voxel edge. encoder: F; solver: from given starts; local: encodes patches; motion: allowed."""
 
     def __init__(
         self,
         source: Prepared,
         target: Prepared,
-        encoder: Encoder,
+        encoder: FastEncoder,
+        solver: Solver,
         local: LocalEncoder,
         motion: Motion,
         *,
-        voxel_size: float | None,
+        edge: float,
+        keypoints: int,
         normalize: bool,
         points: int,
         iterations: int,
         robust: bool,
         seed: int,
+        threads: int = 1,
     ) -> None:
-        self.source, self.target, self.encoder, self.local, self.motion = source, target, encoder, local, motion
+        self.threads = threads
+        self.source, self.target, self.motion = source, target, motion
+        self.encoder, self.solver, self.local = encoder, solver, local
         self.iterations, self.robust, self.seed = iterations, robust, seed
-        self.edge = voxel_size or pair_edge(source, target)
+        self.edge, self.keypoints = edge, keypoints
         self.s, self.t = source.surface(self.edge), target.surface(self.edge)
         if min(len(self.s.points), len(self.t.points)) < MIN_POINTS:
             small = source if len(self.s.points) < MIN_POINTS else target
@@ -162,17 +169,20 @@ class Pair:
         self.length = 2 * float(np.abs(self.t.points - self.t.points.mean(0)).max()) if normalize else 1.0
         self.origins = (self.s.points.mean(0), self.t.points.mean(0)) if normalize else (-source.centre, -target.centre)
         rng = np.random.default_rng(seed)
-        device = next(encoder.parameters()).device
         self.Q, self.P = (
-            torch.from_numpy(((sample(x.points, points, rng) - c) / self.length).astype(np.float32))[None].to(device)
+            ((sample(x.points, points, rng) - c) / self.length).astype(np.float32)
             for x, c in zip((self.s, self.t), self.origins, strict=True)
         )
 
     @cached_property
+    def feature(self) -> np.ndarray:
+        """F(P) of the target."""
+        return self.encoder(self.P)
+
+    @cached_property
     def template(self) -> Template:
         """The global feature of the target, and its Jacobian."""
-        with torch.inference_mode():
-            return make_template(self.encoder, self.P)
+        return self.encoder.template(self.P)
 
     # Between the local frames and the encoder's: x -> (x - origin) / length.
 
@@ -188,11 +198,20 @@ class Pair:
 
     # Where a pose may start.
 
+    def describe(self) -> None:
+        """Works out what concerns one cloud alone; both side by side where there are two threads for it."""
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(self.described, (self.source, self.target)))
+
+    def described(self, cloud: Prepared) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints of a cloud and their descriptors."""
+        return cloud.described(self.edge, self.keypoints, self.local)
+
     @cached_property
     def matches(self) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints of source and target whose descriptors match: (C, 3) each, row by row."""
-        (p, a), (q, b) = self.source.described(self.edge, self.local), self.target.described(self.edge, self.local)
-        pairs = match(a, b).numpy()
+        (p, a), (q, b) = self.described(self.source), self.described(self.target)
+        pairs = match(a, b)
         return p[pairs[:, 0]], q[pairs[:, 1]]
 
     def votes(self, T: np.ndarray) -> int:
@@ -202,70 +221,68 @@ class Pair:
         return int((distance < CONSENSUS_TOLERANCE * self.edge).sum())
 
     @cached_property
-    def agreed(self) -> list[tuple[np.ndarray, int, float]]:
-        """Poses that matches agree on, best first, each with its votes and its coincidence."""
-        x, y = (torch.from_numpy((k / self.edge).astype(np.float32)) for k in self.matches)
+    def agreed(self) -> list[tuple[np.ndarray, float]]:
+        """Poses that matches agree on, best first, each with its coincidence."""
+        x, y = (k / self.edge for k in self.matches)
         motion = Motion(self.motion.dof, self.motion.up, self.motion.lift / self.edge)
-        T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0].double().numpy()
+        T = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0]
         T[:, :3, 3] *= self.edge
-        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in T]
+        return [(pose, self.coincidence(pose)) for pose in T]
 
     def from_features(self) -> list[Start]:
         """Matched local features and their spatial consensus: any rotation, part overlap."""
-        return [Start(T, "features", []) for T, _, _ in self.agreed]
+        return [Start(T, "features", []) for T, _ in self.agreed]
 
-    @torch.inference_mode()
     def from_search(self) -> list[Start]:
         """The global feature from rotations spread over all that are allowed: any rotation, full overlap."""
         starts = self.motion.starts(STARTS)
         if self.motion.dof == "planar":
-            up = torch.tensor(self.motion.up, dtype=torch.float64)
-            offset = float(up @ torch.from_numpy(self.origins[0] - self.origins[1]))
+            up = np.array(self.motion.up)
+            offset = up @ (self.origins[0] - self.origins[1])
             starts[:, :3, 3] = (self.motion.lift + offset) / self.length * up
-        found = search(self.encoder, self.Q, self.P, starts, self.robust, self.motion.basis())
-        poses = found.g.double().cpu().numpy()
-        return [Start(self.restored(g), "search", e.tolist()) for g, e in zip(poses, found.errors.T, strict=True)]
+        found = search(self.solver, self.Q, self.P, starts, self.robust, self.motion.basis(), self.threads)
+        return [Start(self.restored(g), "search", e.tolist()) for g, e in zip(found.g, found.errors.T, strict=True)]
 
     def from_pose(self, T: np.ndarray, name: str) -> list[Start]:
         """The allowed pose next to T."""
-        return [Start(self.motion.exact(torch.from_numpy(T)).numpy(), name, [])]
+        return [Start(self.motion.exact(T), name, [])]
 
-    @torch.inference_mode()
     def from_solver(self, T: np.ndarray, name: str) -> list[Start]:
         """Where the IC solver of the paper goes from the allowed pose next to T."""
-        g = torch.from_numpy(self.normalised(self.from_pose(T, name)[0].T)[None]).to(self.Q)
-        found = solve(self.encoder, self.template, self.Q, g, self.iterations, self.robust, self.motion.basis())
-        return [Start(self.restored(found.g[0].double().cpu().numpy()), name, found.errors[:, 0].tolist())]
+        g = self.normalised(self.from_pose(T, name)[0].T)[None]
+        found = self.solver.solve(self.template, self.Q, g, self.iterations, self.robust, self.motion.basis())
+        return [Start(self.restored(found.g[0]), name, found.errors[:, 0].tolist())]
 
     # How a pose is refined and judged.
 
-    def coincidence(self, T: np.ndarray) -> float:
-        """How much of the source comes close to the target at T, from 0 to 1, on few points."""
-        some = sample(self.s.points, RANKING_POINTS, np.random.default_rng(self.seed))
-        reach = 2 * self.edge
-        d = self.t.tree.query(some @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)[0]
-        return float(np.maximum(0, 1 - d / reach).mean())
+    @cached_property
+    def some(self) -> tuple[np.ndarray, np.ndarray]:
+        """A few of the source's points, and their normals."""
+        both = sample(np.hstack([self.s.points, self.s.normals]), RANKING_POINTS, np.random.default_rng(self.seed))
+        return both[:, :3], both[:, 3:]
 
-    def refine(
-        self, T: np.ndarray, levels: tuple[tuple[float, float], ...], iterations: int
-    ) -> tuple[np.ndarray, float]:
-        """Patch by patch from coarse to fine: the pose, and the median patch error over the mean feature norm."""
-        g, error = torch.from_numpy(T.copy()), float("nan")
+    def coincidence(self, T: np.ndarray) -> float:
+        """How much of the source comes close to the target at T, normals along, from 0 to 1, on few points."""
+        points, normals = self.some
+        reach = 2 * self.edge
+        d, i = self.t.tree.query(points @ T[:3, :3].T + T[:3, 3], distance_upper_bound=reach)
+        here = np.isfinite(d)
+        cosine = np.einsum("ni,ni->n", normals[here] @ T[:3, :3].T, self.t.normals[i[here]])
+        return float(((1 - d[here] / reach) * cosine**4).sum() / len(points))
+
+    def refine(self, T: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
+        """The pose after the feature metric of local patches, from coarse to fine."""
+        g = T.copy()
         g[:3, 3] /= self.length
         for radius, coarseness in levels:
             s, t = (x.surface(self.edge * coarseness) for x in (self.source, self.target))
             reach = radius * self.edge
-            centres = torch.from_numpy(self.patch_centres(s, t, g.numpy(), reach) / self.length).float()
-            with torch.inference_mode():
-                template = patch_template(self.encoder, centres, balls(t, reach, self.length), reach / self.length)
-                fit = refine(
-                    self.encoder, template, balls(s, reach, self.length), g, iterations, self.motion.basis()
-                )  # fmt: skip
-            g = fit.g
-            error = float(fit.error.nanmedian() / template.feature.norm(dim=1).mean().clamp_min(1e-12))
-        T = g.numpy().copy()
-        T[:3, 3] *= self.length
-        return T, error
+            centres = self.patch_centres(s, t, g, reach) / self.length
+            look_s, look_t = balls(s, reach, self.length), balls(t, reach, self.length)
+            template = patch_template(self.encoder.layers, centres, look_t, reach / self.length)
+            g = refine(self.encoder.layers, template, look_s, g, PATCH_ITERATIONS, self.motion.basis()).g
+        g[:3, 3] *= self.length
+        return g
 
     def patch_centres(self, s: Surface, t: Surface, g: np.ndarray, reach: float) -> np.ndarray:
         """Points of the target, spread evenly, that the source comes near to at g: (P, 3)."""
@@ -274,22 +291,17 @@ class Pair:
         common = some[np.isfinite(s.tree.query(back, distance_upper_bound=reach / 2)[0])]
         return (common if len(common) >= 8 else some)[:PATCHES]
 
-    def judged(self, T: np.ndarray, start: Start, patches: float) -> Candidate:
-        """A pose with the evidence gathered at it; patches: the median patch error there."""
-        votes, coincidence = self.votes(T), self.coincidence(T)
-        rivals = [(v, c) for pose, v, c in self.agreed + self.chance if not self.same(T, pose)]
-        fit = verdict.fit(self.s, self.t, T)
+    def judged(self, T: np.ndarray, start: Start) -> Candidate:
+        """A pose with the evidence gathered at it."""
+        rivals = [coincidence for pose, coincidence in self.agreed + self.chance if not self.same(T, pose)]
         return Candidate(
             T,
             start.name,
             start.errors,
             verdict.Evidence(
-                **fit,
-                patches=patches if np.isfinite(patches) else 1.0,
-                votes=votes,
-                votes_over_rival=(votes + 1) / (max(v for v, _ in rivals) + 1),
-                fit_over_rival=coincidence / max(max(c for _, c in rivals), 1e-3),
-                contrast=self.chance_error / max(self.feature_error(T), 1e-9),
+                **verdict.fit(self.s, self.t, T),
+                votes=self.votes(T),
+                fit_over_rival=self.coincidence(T) / max(*rivals, 1e-3),
             ),
         )
 
@@ -299,38 +311,35 @@ class Pair:
         return bool(angle < DISTINCT_DEGREES and np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge)
 
     @cached_property
-    def chance(self) -> list[tuple[np.ndarray, int, float]]:
-        """Poses as good as random, rotations about the means, each with its votes and its coincidence."""
-        poses = [self.restored(g) for g in rotations(CHANCE_POSES).numpy()]
-        return [(pose, self.votes(pose), self.coincidence(pose)) for pose in poses]
-
-    @cached_property
-    def chance_error(self) -> float:
-        """The median of the global feature's error at those."""
-        return float(np.median([self.feature_error(pose) for pose, _, _ in self.chance]))
+    def chance(self) -> list[tuple[np.ndarray, float]]:
+        """Poses as good as random, rotations about the means, each with its coincidence."""
+        poses = [self.restored(g) for g in rotations(CHANCE_POSES)]
+        return [(pose, self.coincidence(pose)) for pose in poses]
 
     def candidate(self, start: Start, polished: bool, scale: bool) -> Candidate:
         """A start, refined patch by patch, polished where asked, and judged."""
-        T = self.motion.exact(torch.from_numpy(start.T)).numpy()
-        T, patches = self.refine(T, FINE if start.name == "features" else LEVELS, PATCH_ITERATIONS)
-        if polished:
-            T = self.polished(T, scale)
-            _, patches = self.refine(T, FINE, 0)
-        return self.judged(T, start, patches)
+        T = self.motion.exact(start.T)
+        if start.name != "features":
+            T = self.refine(T, LEVELS)
+        elif not polished:  # the polish alone comes as far from within CONSENSUS_TOLERANCE
+            T = self.refine(T, FINE)
+        return self.judged(self.polished(T, scale) if polished else T, start)
 
     def polished(self, T: np.ndarray, scale: bool) -> np.ndarray:
         """The pose after the last geometric step."""
         if scale or self.motion.dof != "rigid":
             s, t = self.source.fine(POLISH_SOURCE, self.edge), self.target.fine(POLISH_TARGET, self.edge)
-            return polish.constrained(s, t, T, self.edge, self.motion.basis().numpy(), scale)
-        target = self.target.for_gicp(POLISH_TARGET, self.edge)
+            return polish.constrained(s, t, T, self.edge, self.motion.basis(), scale)
+        target = self.target.for_gicp(POLISH_TARGET, self.edge, self.threads)
         return self.gicp(self.source.fine(POLISH_SOURCE, self.edge), target, T)
 
     def gicp(self, source: np.ndarray, target: polish.GicpCloud, T: np.ndarray) -> np.ndarray:
         """GICP from T of those of the source's points that are in reach of the target."""
         moved = source @ T[:3, :3].T + T[:3, 3]
         near = source[np.isfinite(self.t.tree.query(moved, distance_upper_bound=POLISH_REACH * self.edge)[0])]
-        return T if len(near) < MIN_POINTS else polish.gicp(polish.GicpCloud(near, self.edge), target, T, self.edge)
+        if len(near) < MIN_POINTS:
+            return T
+        return polish.gicp(polish.GicpCloud(near, self.edge, self.threads), target, T, self.edge)
 
     def exact(self, T: np.ndarray) -> np.ndarray:
         """The pose after a polish on the points themselves, where the one before saw a share or a grid of them.
@@ -344,13 +353,12 @@ class Pair:
         if np.median(tree.query(some, distance_upper_bound=self.edge)[0]) > COMMON * self.target.spacing:
             return T
         source = sample(self.source.points, POLISH_SOURCE, np.random.default_rng(self.seed))
-        return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, own=True), T)
+        return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, self.threads, own=True), T)
 
-    @torch.inference_mode()
     def feature_error(self, T: np.ndarray) -> float:
         """Mean |F(T Q) - F(P)| of the global feature at a pose."""
-        g = torch.from_numpy(self.normalised(T)[None]).to(self.Q)
-        return float(solve(self.encoder, self.template, self.Q, g, 0).error)
+        g = self.normalised(T).astype(np.float32)
+        return float(np.abs(self.encoder(self.Q @ g[:3, :3].T + g[:3, 3]) - self.feature).mean())
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:
@@ -362,12 +370,7 @@ def pair_edge(source: Prepared, target: Prepared) -> float:
 def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
     """Look-ups for ``feature_metric.patches``: centres in units of ``length``, balls of ``radius`` (own unit)."""
 
-    def look(centres: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        c = centres.double().numpy() * length
-        index = surface.tree.query(c, BALL_POINTS, distance_upper_bound=radius)[1]
-        valid = index < len(surface.points)
-        offsets = (surface.points[np.where(valid, index, 0)] - c[:, None]) / radius
-        mask = torch.from_numpy(valid.astype(np.float32))
-        return torch.from_numpy(offsets.astype(np.float32)) * mask[..., None], mask, mask.sum(1)
+    def look(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return surface.around(centres * length, radius, BALL_POINTS)[:2]
 
     return look

@@ -12,22 +12,25 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.preprocess import Surface, normals_and_variation
+from fmr_cli.preprocess import Surface, neighbours, normals_and_variation
 
 ITERATIONS = 30
 COVARIANCE_NEIGHBOURS = 10
-WEAK = 1e-3  # of the strongest direction's information
+WEAK = 2e-3  # of the strongest direction's information: what the noise of the normals alone pretends to
 
 
 class GicpCloud:
-    """Points with their covariances as small_gicp takes them, in voxel edges, so that its thresholds have no unit."""
+    """Points with their covariances as small_gicp takes them, in voxel edges, so that its thresholds have no unit.
 
-    def __init__(self, points: np.ndarray, edge: float) -> None:
+    threads: to work on the points, each by itself, so that nothing depends on their number.
+    """
+
+    def __init__(self, points: np.ndarray, edge: float, threads: int = 1) -> None:
         import small_gicp
 
         self.cloud = small_gicp.PointCloud(points / edge)
         self.tree = small_gicp.KdTree(self.cloud)
-        small_gicp.estimate_covariances(self.cloud, self.tree, COVARIANCE_NEIGHBOURS)
+        small_gicp.estimate_covariances(self.cloud, self.tree, COVARIANCE_NEIGHBOURS, threads)
 
 
 def gicp(source: GicpCloud, target: GicpCloud, T: np.ndarray, edge: float) -> np.ndarray:
@@ -36,7 +39,7 @@ def gicp(source: GicpCloud, target: GicpCloud, T: np.ndarray, edge: float) -> np
 
     g = T.copy()
     g[:3, 3] /= edge
-    for reach, iterations, epsilon in ((2.0, 10, 1e-3), (1.0, ITERATIONS, 1e-6)):
+    for reach, iterations, epsilon in ((2.0, 10, 1e-2), (1.0, 10, 1e-4)):
         g = small_gicp.align(
             target.cloud, source.cloud, target.tree, g, registration_type="GICP", max_correspondence_distance=reach,
             max_iterations=iterations, rotation_epsilon=epsilon / 10, translation_epsilon=epsilon,
@@ -86,7 +89,7 @@ def constrained(
 ) -> np.ndarray:
     """Point-to-plane from T (4x4) within the span of basis (6, d), and with one scale factor where asked."""
     tree = cKDTree(target)
-    normals = normals_and_variation(target, tree)[0]
+    normals = normals_and_variation(target, *neighbours(target, tree))[0]
     B = np.zeros((7, basis.shape[1] + scale))
     B[:6, : basis.shape[1]] = basis
     if scale:

@@ -8,25 +8,30 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
+import scipy
+from threadpoolctl import ThreadpoolController
 
 import fmr_cli
 from fmr_cli import polish, verdict
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import FmrError
 from fmr_cli.feature_metric.motion import Dof, Motion
-from fmr_cli.pair import Candidate, Pair, Prepared, Start
-from fmr_cli.weights import bundled_local_encoder, encoder
+from fmr_cli.pair import KEYPOINTS, Candidate, Pair, Prepared, Start, pair_edge
+from fmr_cli.weights import bundled_local_encoder, fast_encoder, solver
 
 Init = Literal["auto", "search", "features", "centroid", "identity"]
 REFINED = 3  # starts that are refined, of each kind
-SURE, RIVAL = 0.95, 0.85  # once a pose is that sure, only starts that coincide nearly as much are looked at
+SURE, RIVAL = 0.95, 0.8  # once a pose is that sure, only starts that coincide nearly as much are looked at
+SETTLED = 0.8  # once a pose is that sure, no other kind of start is tried
+COARSE, COARSE_KEYPOINTS = 1.5, 250  # a first look on larger voxels, at fewer places, which is often sure already
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
 
@@ -43,7 +48,7 @@ class Options:
     robust: robust weights, or the paper's plain least squares.
     refine: finish with a geometric polish (GICP).
     model: the global encoder's weights (.safetensors), or None for the bundled ones.
-    device: "auto", "cpu" or "cuda": where the global encoder runs.
+    device: "cpu", "cuda" or "auto" (the CPU): where the solver of the global feature runs.
     seed: of every random choice; the same seed gives the same answer.
     dof: "rigid", "yaw" (rotation about ``up``, any translation), "translation", "planar" (yaw, and no shift along up).
     up: the vertical, any length. scale: also estimate one scale factor.
@@ -73,7 +78,7 @@ class Registration:
 
     T_target_source: (4, 4) float64, x_target = s R x_source + t, in the clouds' own unit; s is 1 unless asked for.
     status: "aligned", or "uncertain" where the evidence at the pose speaks against it.
-    confidence: the probability, from 0 to 1, that the pose is right.
+    confidence: the probability, from 0 to 1, that the pose is right; poses that fit as well share it.
     overlap: share of the smaller cloud's points that have a counterpart in the other one.
     inlier_rmse: root mean square distance of those counterparts, own unit.
     feature_error_before, feature_error_after: mean |F(g Q) - F(P)| of the global feature as the files are, and at T.
@@ -84,8 +89,8 @@ class Registration:
     information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's
         mean; rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.
     undetermined: the directions that the scans hardly determine, in words.
-    alternatives: other poses that would be called aligned too, as of a symmetric shape, best first: T_target_source,
-        confidence, feature_error.
+    alternatives: other poses that would be called aligned if alone, as of a symmetric shape, best first:
+        T_target_source, confidence, feature_error.
     evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
     """
 
@@ -135,11 +140,11 @@ def plain(value: Any) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """What could change a result: this tool, torch, numpy, Python and the processor's architecture."""
+    """What could change a result: this tool, the libraries that compute, Python and the processor's architecture."""
     return {
         "fmr": fmr_cli.__version__,
-        "torch": torch.__version__,
         "numpy": np.__version__,
+        "scipy": scipy.__version__,
         "python": platform.python_version(),
         "machine": platform.machine(),
     }
@@ -150,6 +155,12 @@ def prepare(cloud: PointCloud, seed: int = 0) -> Prepared:
     return Prepared(cloud, seed)
 
 
+@cache
+def blas() -> ThreadpoolController:
+    """The libraries behind numpy's matrix products: on blocks as small as ours, their threads only wait."""
+    return ThreadpoolController()
+
+
 @contextmanager
 def stage(seconds: dict[str, float], name: str) -> Iterator[None]:
     """Adds the wall time of its block to ``seconds[name]``."""
@@ -158,25 +169,33 @@ def stage(seconds: dict[str, float], name: str) -> Iterator[None]:
     seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-def align(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options()) -> Registration:
+def align(
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options(), threads: int = 2
+) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
-    A pair is worked on by one thread, so that the answer is the same bit for bit wherever it is asked for; many pairs
-    run side by side. Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or
-    the device, FmrError for options that contradict each other.
+    threads: 2 for what concerns one cloud alone to be done for both side by side, 1 where pairs run side by side
+    already. The answer is the same bit for bit, whatever their number and the machine's. Raises RegistrationError
+    where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
+    contradict each other.
     """
-    if torch.get_num_threads() != 1:
-        torch.set_num_threads(1)
+    with blas().limit(limits=1):
+        return _align(source, target, options, threads)
+
+
+def _align(
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, threads: int
+) -> Registration:
     seconds: dict[str, float] = {}
     begin = time.perf_counter()
-    with stage(seconds, "prepare"):
-        source = source if isinstance(source, Prepared) else prepare(source, options.seed)
-        target = target if isinstance(target, Prepared) else prepare(target, options.seed)
+    with stage(seconds, "prepare"), ThreadPoolExecutor(threads) as pool:
+        source, target = pool.map(
+            lambda cloud: cloud if isinstance(cloud, Prepared) else prepare(cloud, options.seed), (source, target)
+        )
     best: tuple[Pair, float, list[Candidate]] | None = None
     for factor in scale_factors(source, target, options) if options.scale else (1.0,):
         scaled, given = (source, options) if factor == 1.0 else (source.scaled(factor), unscaled(options, factor))
-        pair = make_pair(scaled, target, options)
-        candidates = find(pair, given, seconds)
+        pair, candidates = look(scaled, target, given, threads, seconds)
         if best is None or candidates[0].confidence > best[2][0].confidence:
             best = pair, factor, candidates
     assert best is not None
@@ -188,7 +207,21 @@ def align(source: PointCloud | Prepared, target: PointCloud | Prepared, options:
     return found
 
 
-def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
+def look(
+    source: Prepared, target: Prepared, options: Options, threads: int, seconds: dict[str, float]
+) -> tuple[Pair, list[Candidate]]:
+    """The candidates, best first, and the pair that they were found on: a coarse one where that leaves no doubt."""
+    auto = isinstance(options.init, str) and options.init == "auto"
+    if auto and options.voxel_size is None and not options.scale:
+        pair = make_pair(source, target, options, threads, coarse=True)
+        candidates = find(pair, replace(options, init="features"), seconds)
+        if candidates[0].confidence >= SURE:
+            return pair, candidates
+    pair = make_pair(source, target, options, threads)
+    return pair, find(pair, options, seconds)
+
+
+def make_pair(source: Prepared, target: Prepared, options: Options, threads: int = 1, *, coarse: bool = False) -> Pair:
     """The two clouds at their common voxel edge, with the encoders and the motions that the options ask for."""
     up = np.asarray(options.up, float)
     if not np.isfinite(up).all() or np.linalg.norm(up) == 0:
@@ -197,36 +230,39 @@ def make_pair(source: Prepared, target: Prepared, options: Options) -> Pair:
     motion = Motion(
         options.dof, (float(up[0]), float(up[1]), float(up[2])), float(up @ (source.centre - target.centre))
     )
+    edge = options.voxel_size or pair_edge(source, target) * (COARSE if coarse else 1.0)
     return Pair(
-        source, target, encoder(options.model, options.device), bundled_local_encoder(), motion,
-        voxel_size=options.voxel_size, normalize=options.normalize, points=options.points,
-        iterations=options.iterations, robust=options.robust, seed=options.seed,
+        source, target, fast_encoder(options.model), solver(options.model, options.device), bundled_local_encoder(),
+        motion, edge=edge, keypoints=COARSE_KEYPOINTS if coarse else KEYPOINTS, normalize=options.normalize,
+        points=options.points, iterations=options.iterations, robust=options.robust, seed=options.seed,
+        threads=threads,
     )  # fmt: skip
 
 
 def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candidate]:
-    """Candidates, best first, from the starts that the options name; "auto" goes on while none is aligned."""
+    """Candidates, best first, from the starts that the options name; "auto" goes on while none is settled."""
     candidates: list[Candidate] = []
+    with stage(seconds, "describe"):
+        pair.describe()
     for name, starts in start_makers(pair, options):
         with stage(seconds, name):
             ranked = sorted(
                 ((pair.coincidence(s.T), s) for s in starts() if within_bounds(s.T, pair, options)), key=lambda x: -x[0]
             )
         with stage(seconds, "refine"):
-            for coincidence, start in ranked[:REFINED]:
-                sure = candidates and max(c.confidence for c in candidates) >= SURE
-                if sure and coincidence < RIVAL * ranked[0][0]:
+            for i, (coincidence, start) in enumerate(ranked):
+                enough = i >= REFINED or (candidates and candidates[0].confidence >= SURE)
+                if enough and coincidence < RIVAL * ranked[0][0]:
                     break
                 candidate = pair.candidate(start, options.refine, options.scale)
                 if within_bounds(candidate.T, pair, options):
-                    candidates.append(candidate)
-        candidates.sort(key=lambda c: -c.confidence)
-        if candidates and candidates[0].confidence >= verdict.ALIGNED:
+                    candidates = weighed([*candidates, candidate], pair)
+        if candidates and candidates[0].confidence >= SETTLED:
             break
     if not candidates:  # every pose found lies beyond --max-angle or --max-shift
         here = Start(local_pose(np.eye(4), pair), "identity", [])
-        candidates = [pair.judged(here.T, here, float("nan"))]
-    return distinct(candidates, pair)
+        candidates = weighed([pair.judged(here.T, here)], pair)
+    return candidates
 
 
 def start_makers(pair: Pair, options: Options) -> list[tuple[str, Callable[[], list[Start]]]]:
@@ -265,13 +301,13 @@ def within_bounds(T: np.ndarray, pair: Pair, options: Options) -> bool:
     )
 
 
-def distinct(candidates: list[Candidate], pair: Pair) -> list[Candidate]:
-    """The candidates without those that are another, better one's pose."""
+def weighed(candidates: list[Candidate], pair: Pair) -> list[Candidate]:
+    """The candidates, best first, without those that are a better one's pose; each confidence given the others."""
     kept: list[Candidate] = []
-    for c in candidates:
+    for c in sorted(candidates, key=lambda c: -c.odds):
         if not any(pair.same(c.T, k.T) for k in kept):
             kept.append(c)
-    return kept
+    return [replace(c, confidence=p) for c, p in zip(kept, verdict.confidences([c.odds for c in kept]), strict=True)]
 
 
 def describe(
@@ -301,7 +337,7 @@ def describe(
                 "feature_error": pair.feature_error(c.T),
             }
             for c in others
-            if c.confidence >= verdict.ALIGNED
+            if c.odds >= 1  # by itself more likely right than not
         ]
         warnings = ["other poses fit about as well, see alternatives"] if alternatives else []
         before, after = pair.feature_error(local_pose(np.eye(4), pair)), pair.feature_error(best.T)

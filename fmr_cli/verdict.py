@@ -6,6 +6,7 @@ weights come from ``python -m benchmarks.calibrate``, fitted on procedural scene
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,8 @@ import numpy as np
 from fmr_cli.preprocess import Surface
 
 ALIGNED = 0.5  # confidence from which a pose is called aligned
-TOUCHING, NEAR, AROUND = 1.5, 0.8, 2.4  # voxel edges
+TOUCHING = 1.5  # voxel edges
+FLOOR = 0.01  # offsets in voxel edges, and turns: less than that is as good as none
 
 
 @dataclass(frozen=True)
@@ -21,59 +23,63 @@ class Evidence:
     """What speaks for a pose.
 
     overlap: share of the smaller scan within TOUCHING of the other one. inlier_rmse: of those, own unit.
-    near: of the points within AROUND of the other scan, the share within NEAR: surfaces that coincide, not just cross.
-    normals: mean |cosine| between the normals of touching points.
-    patches: median patch residual at the pose over the patches' mean feature norm; 1 where none is co-occupied.
+    offset: how far touching points lie off each other's tangent planes, root mean square, over how far a surface's own
+        neighbours do.
+    turn: the mean of 1 - |cosine| between their normals, over the same. Both are about 1 or less where the scans are
+        samples of one surface, whatever its curvature and noise.
     votes: how many matches of local features agree with the pose, whether or not it came from them.
-    votes_over_rival, fit_over_rival: the votes (plus one) and the share of the source that coincides with the target,
-        each over the most that another pose has, which matches agree on but which was rejected.
-    contrast: the global feature's error at a pose as good as random, over that at this one.
+    fit_over_rival: the share of the source that coincides with the target, normals too, over the most at other poses:
+        those that matches agree on, and some as good as random.
     """
 
     overlap: float
     inlier_rmse: float
-    near: float
-    normals: float
-    patches: float
+    offset: float
+    turn: float
     votes: int
-    votes_over_rival: float
     fit_over_rival: float
-    contrast: float
 
     def vector(self) -> np.ndarray:
         """What the logistic model sees, after a 1 for the intercept: of each kind of evidence, more is better."""
-        ratios = [self.overlap, self.votes_over_rival, self.fit_over_rival, self.contrast, 1 / max(self.patches, 1e-3)]
-        return np.array([1.0, self.near, self.normals, np.log1p(self.votes), *np.log(np.clip(ratios, 1e-2, 1e2))])
+        ratios = [1 / self.offset, 1 / self.turn, self.fit_over_rival]
+        return np.array([1.0, np.log1p(self.votes), *np.log(np.clip(ratios, 1e-2, 1e2))])
 
 
 def fit(source: Surface, target: Surface, T: np.ndarray) -> dict[str, float]:
     """How the surfaces fit at T (4x4, source to target, in their frames), both on the same voxel edge.
 
-    Returns the ``Evidence`` that geometry gives: overlap, inlier_rmse, near, normals.
+    Returns the ``Evidence`` that geometry gives: overlap, inlier_rmse, offset, turn.
     """
-    edge = target.edge
-    moved = source.points @ T[:3, :3].T + T[:3, 3]
-    back = (target.points - T[:3, 3]) @ np.linalg.inv(T[:3, :3]).T
-    forth_d, forth_i = target.tree.query(moved, distance_upper_bound=AROUND * edge)
-    back_d = source.tree.query(back, distance_upper_bound=AROUND * edge)[0]
-    touching = np.concatenate([forth_d, back_d])
-    touching = touching[touching < TOUCHING * edge]
-    around = np.isfinite(forth_d).sum() + np.isfinite(back_d).sum()
-    near = (forth_d < NEAR * edge).sum() + (back_d < NEAR * edge).sum()
-    here = np.flatnonzero(forth_d < TOUCHING * edge)
-    cosine = np.einsum("ni,ni->n", source.normals[here] @ T[:3, :3].T, target.normals[forth_i[here]])
+    shares, sums = [], np.zeros(6)
+    for a, b, g in ((source, target, T), (target, source, np.linalg.inv(T))):
+        moved = a.points @ g[:3, :3].T + g[:3, 3]
+        distance, index = b.tree.query(moved, distance_upper_bound=TOUCHING * target.edge)
+        here = np.flatnonzero(np.isfinite(distance))
+        there = index[here]
+        off = np.einsum("ni,ni->n", moved[here] - b.points[there], b.normals[there]) / target.edge
+        turn = 1 - np.abs(np.einsum("ni,ni->n", a.normals[here] @ g[:3, :3].T, b.normals[there]))
+        own_off, own_turn = b.unevenness[0][there] / target.edge, b.unevenness[1][there]
+        sums += [len(here), (distance[here] ** 2).sum(), off @ off, own_off @ own_off, turn.sum(), own_turn.sum()]
+        shares.append(len(here) / len(distance))
+    count = max(sums[0], 1.0)
+    square, off2, own_off2, turns, own_turns = sums[1:] / count
     return {
-        "overlap": float(max(np.mean(forth_d < TOUCHING * edge), np.mean(back_d < TOUCHING * edge))),
-        "inlier_rmse": float(np.sqrt(np.mean(touching**2))) if len(touching) else float("inf"),
-        "near": float(near / max(around, 1)),
-        "normals": float(np.abs(cosine).mean()) if len(here) else 0.0,
+        "overlap": max(shares),
+        "inlier_rmse": float(np.sqrt(square)) if sums[0] else float("inf"),
+        "offset": float(np.sqrt((off2 + FLOOR**2) / (own_off2 + FLOOR**2))),
+        "turn": float((max(turns, 0) + FLOOR) / (own_turns + FLOOR)),
     }
 
 
-# `python -m benchmarks.calibrate --pairs 130 --seed 41000`
-WEIGHTS = np.array([-5.613, 0.0, 3.203, 0.558, 1.469, 1.699, 1.892, 1.175, 0.0])
+# `python -m benchmarks.calibrate --pairs 240 --seed 42000`
+WEIGHTS = np.array([-7.358, 2.229, 2.275, 1.513, 2.211])
 
 
-def confidence(evidence: Evidence) -> float:
-    """The probability that the pose is right: logistic regression on the evidence."""
-    return float(1 / (1 + np.exp(-np.clip(WEIGHTS @ evidence.vector(), -50, 50))))
+def odds(evidence: Evidence) -> float:
+    """The odds that the pose is right and not none at all: logistic regression on the evidence."""
+    return float(np.exp(np.clip(WEIGHTS @ evidence.vector(), -50, 50)))
+
+
+def confidences(odds: Sequence[float]) -> list[float]:
+    """The probability of each of several distinct poses, of which at most one is right: the odds share out 1."""
+    return [o / (1 + sum(odds)) for o in odds]

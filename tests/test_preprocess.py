@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from fmr_cli.preprocess import (
     WORKING_VOXELS,
     Surface,
     distinct,
+    neighbours,
     normals_and_variation,
     occupied_voxels,
     sample,
@@ -77,7 +79,7 @@ def test_normals_and_variation_of_a_plane_and_a_corner() -> None:
     x, y = (c.ravel() for c in np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 30)))
     floor, wall = np.stack([x, y, 0 * x], 1), np.stack([0 * x, y, x + 1e-3], 1)
     points = np.vstack([floor, wall])
-    normals, variation, _ = normals_and_variation(points, cKDTree(points))
+    normals, variation, *_ = normals_and_variation(points, *neighbours(points, cKDTree(points)))
     inside = (points[:, 0] > 0.3) & (points[:, 0] < 0.7)
     np.testing.assert_allclose(np.abs(normals[inside]), np.broadcast_to([0, 0, 1], (inside.sum(), 3)), atol=1e-9)
     edge = (points[:, 0] < 0.05) & (points[:, 2] < 0.05)
@@ -92,9 +94,16 @@ def test_keypoints_are_spread_out_and_where_the_surface_bends(scan: np.ndarray) 
     assert len(index) == len(set(index)) == 300
     cells = np.floor((surface.points[index] - surface.points.min(0)) / (2 * edge))
     assert len(np.unique(cells, axis=0)) == 300
-    variation = normals_and_variation(surface.points, surface.tree)[1]
+    variation = normals_and_variation(surface.points, *neighbours(surface.points, surface.tree))[1]
     assert variation[index].mean() > 2 * variation.mean()
     assert np.array_equal(index, Surface(scan, edge).keypoints(300))
+
+
+def test_a_sheet_has_its_keypoints_on_its_outline() -> None:
+    sheet = np.random.default_rng(0).uniform(-1, 1, (9000, 3)) * [1, 0.7, 0]
+    surface = Surface(sheet, 0.03)
+    found = np.abs(surface.points[surface.keypoints(100)])
+    assert np.mean((found[:, 0] > 0.94) | (found[:, 1] > 0.64)) > 0.9
 
 
 def test_patches_hold_neighbours_within_the_radius_nearest_first(scan: np.ndarray) -> None:
@@ -103,10 +112,29 @@ def test_patches_hold_neighbours_within_the_radius_nearest_first(scan: np.ndarra
     index = surface.keypoints(20)
     patches = surface.patches(index, 4.0, 100)
     assert {k: v.shape for k, v in patches.items()} == {
-        "offsets": (20, 100, 3), "valid": (20, 100), "normal": (20, 3), "neighbour_normals": (20, 100, 3),
+        "offsets": (20, 100, 3), "valid": (20, 100), "normal": (20, 3), "neighbours": (20, 100),
+        "normals": (len(surface.points), 3),
     }  # fmt: skip
     length = np.linalg.norm(patches["offsets"], axis=2)
     assert (length[patches["valid"] == 1] <= 1).all()
     assert (np.diff(np.where(patches["valid"] == 1, length, 2), axis=1) >= 0).all()
     brute = np.linalg.norm(surface.points - surface.points[index[0]], axis=1) < 4 * edge
     assert patches["valid"][0].sum() == min(brute.sum(), 100)
+
+
+@pytest.mark.parametrize(
+    "spread", [(1, 1, 1), (1, 1, 1e-3), (1, 1e-3, 1e-3), (1, 1, 0), (1, 0, 0), (1e-9, 1e-9, 1e-11)]
+)
+def test_the_closed_form_of_the_normals_is_that_of_lapack(spread: tuple[float, ...]) -> None:
+    points = np.random.default_rng(0).normal(size=(1000, 3)) * spread
+    tree = cKDTree(points)
+    distance, index = neighbours(points, tree)
+    normals, variation, *_ = normals_and_variation(points, distance, index)
+    near = points[index]
+    centred = near - near.mean(1, keepdims=True)
+    C = np.swapaxes(centred, 1, 2) @ centred
+    values, sums = np.linalg.eigvalsh(C), np.trace(C, axis1=1, axis2=2)
+    np.testing.assert_allclose(variation, values[:, 0] / sums, rtol=0, atol=1e-12)
+    reached = np.einsum("ni,nij,nj->n", normals, C, normals) / sums  # also where the direction is free
+    np.testing.assert_allclose(reached, values[:, 0] / sums, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-12)

@@ -14,7 +14,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.errors import ModelError
+from fmr_cli.feature_metric.weight_file import read_weights
 
 HIDDEN = (64, 64, 64, 128)
 FEATURE_DIM = 1024
@@ -120,26 +120,9 @@ def load_encoder(path: Path | str) -> Encoder:
 
 def load_weights(path: Path | str) -> tuple[Encoder, dict[str, Tensor]]:
     """The encoder and the decoder's tensors (empty where the file holds none)."""
-    from safetensors import SafetensorError, safe_open
-
-    path = Path(path)
-    if not path.is_file():
-        raise ModelError(f"{path}: no such model file; give a .safetensors file written by `fmr train`")
-    try:
-        with safe_open(str(path), "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-    except SafetensorError as error:
-        raise ModelError(f"{path}: not a safetensors file ({error}); give one written by `fmr train`") from None
-    try:
-        architecture = json.loads(metadata["architecture"])
-        encoder = Encoder(int(architecture["feature_dim"]), tuple(architecture["hidden"]))
-        own = {k.removeprefix("encoder."): v for k, v in tensors.items() if k.startswith("encoder.")}
-        encoder.load_state_dict(own)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
-        raise ModelError(
-            f"{path}: the weights do not fit the encoder ({reason}); use one written by `fmr train`"
-        ) from None
-    decoder = {k.removeprefix("decoder."): v for k, v in tensors.items() if k.startswith("decoder.")}
+    weights = read_weights(path)
+    encoder = Encoder(weights.feature_dim, weights.hidden)
+    for layer, (W, b) in zip(encoder.linear, weights.layers, strict=True):
+        layer.weight.data, layer.bias.data = torch.from_numpy(W), torch.from_numpy(b)
+    decoder = {name: torch.from_numpy(array) for name, array in weights.decoder.items()}
     return encoder.eval().requires_grad_(False), decoder

@@ -2,78 +2,102 @@
 
 A patch is the neighbourhood of a keypoint, turned into its own frame (a local reference frame after TOLDI, Yang et al.
 2017) and encoded by a small PointNet of the encoder's kind: a shared MLP, a max over points, two layers. All lengths
-are in voxel edges, so that nothing depends on a unit.
+are in voxel edges, so that nothing depends on a unit. Trained by ``fmr_cli.training.local``.
 """
 
 from __future__ import annotations
 
-import itertools
+from dataclasses import dataclass
+from pathlib import Path
 
-import torch
-from torch import Tensor, nn
+import numpy as np
 
 PATCH_RADIUS = 8.0  # voxel edges
 NEIGHBOURS = 256  # looked up in a patch: about what a surface holds within the radius
 PATCH_POINTS = 64  # of them, encoded
 CHANNELS = 10
+FLAT = 0.01  # patch radii: below it, heights say nothing
+CHUNK = 12  # patches encoded at once: their activations stay in the processor's cache
 
 
-class LocalEncoder(nn.Module):
-    """(K, PATCH_POINTS, CHANNELS) patches -> (K, 32) unit descriptors."""
+@dataclass(frozen=True)
+class LocalEncoder:
+    """The trained weights, each layer (out, in) and (out,), float32: of the points' MLP, and of the head."""
 
-    def __init__(
-        self, point_widths: tuple[int, ...] = (64, 128, 128), head_widths: tuple[int, ...] = (128, 32)
-    ) -> None:
-        super().__init__()
-        self.point_widths, self.head_widths = tuple(point_widths), tuple(head_widths)
-        self.point = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((CHANNELS, *point_widths)))
-        self.head = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((point_widths[-1], *head_widths)))
+    point: list[tuple[np.ndarray, np.ndarray]]
+    head: list[tuple[np.ndarray, np.ndarray]]
 
-    def forward(self, patches: Tensor) -> Tensor:
-        x = patches
-        for layer in self.point:
-            x = torch.relu(layer(x))
-        x = x.amax(-2)
-        for layer in self.head[:-1]:
-            x = torch.relu(layer(x))
-        return nn.functional.normalize(self.head[-1](x), dim=-1)
+    @classmethod
+    def load(cls, path: Path) -> LocalEncoder:
+        from safetensors.numpy import load_file
+
+        w = load_file(path)
+        layers = [
+            [(w[f"{part}.{i}.weight"], w[f"{part}.{i}.bias"]) for i in range(len(w)) if f"{part}.{i}.weight" in w]
+            for part in ("point", "head")
+        ]
+        return cls(*layers)
+
+    def __call__(self, patches: np.ndarray) -> np.ndarray:
+        """(K, PATCH_POINTS, CHANNELS) -> (K, 32) unit descriptors."""
+        pooled = [self.pooled(patches[i : i + CHUNK]) for i in range(0, len(patches), CHUNK)]
+        x = np.concatenate(pooled)
+        for weight, bias in self.head[:-1]:
+            x = np.maximum(x @ weight.T + bias, 0)
+        weight, bias = self.head[-1]
+        x = x @ weight.T + bias
+        return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+
+    def pooled(self, patches: np.ndarray) -> np.ndarray:
+        """The maximum over the points of the MLP; the last bias and ReLU come after it, which is the same."""
+        x = patches.reshape(-1, patches.shape[-1])
+        for weight, bias in self.point[:-1]:
+            x = x @ weight.T
+            x += bias
+            np.maximum(x, 0, out=x)
+        weight, bias = self.point[-1]
+        x = (x @ weight.T).reshape(*patches.shape[:2], -1).max(1)
+        return np.maximum(x + bias, 0)
 
 
-def reference_frames(offsets: Tensor, valid: Tensor, normal: Tensor) -> Tensor:
+def reference_frames(offsets: np.ndarray, valid: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """A frame per patch: offsets (K, n, 3) from the keypoint in patch radii, valid (K, n), normal (K, 3) -> (K, 3, 3).
 
     Rows are the axes. z is the normal, its sign taken so that the patch lies on its negative side; x is the sum of the
-    offsets' tangential parts, near and high points weighted most; both survive a changed sampling.
+    offsets' tangential parts, near and high points weighted most; both survive a changed sampling. Of a flat patch, x
+    points to where most of it lies, so that an outline has features too.
     """
-    height = torch.einsum("kni,ki->kn", offsets, normal) * valid
-    z = torch.where(height.sum(-1, keepdim=True) > 0, -normal, normal)
-    height = torch.einsum("kni,ki->kn", offsets, z) * valid
-    near = (1 - offsets.norm(dim=-1)).clamp_min(0).square() * valid
-    tangential = offsets - height[..., None] * z[:, None]
-    x = ((near * height.square())[..., None] * tangential).sum(1)
-    x = x - (x * z).sum(-1, keepdim=True) * z
-    x = nn.functional.normalize(x, dim=-1, eps=1e-12)
-    return torch.stack([x, torch.linalg.cross(z, x), z], 1)
+    height = (offsets @ normal[..., None])[..., 0] * valid
+    sign = np.where(height.sum(1) > 0, -1, 1).astype(offsets.dtype)
+    z = sign[:, None] * normal
+    near = np.square(np.maximum(1 - np.sqrt((offsets * offsets).sum(-1)), 0)) * valid
+    weight = near * (height * height + FLAT**2)
+    # The weighted sum of offsets - height z, less what rounding leaves along z.
+    x = (weight[:, None] @ offsets)[:, 0] - (sign * (weight * height).sum(1))[:, None] * z
+    x -= (x * z).sum(1, keepdims=True) * z
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+    return np.stack([x, np.cross(z, x), z], 1)
 
 
-def describe_patches(offsets: Tensor, valid: Tensor, normal: Tensor, neighbour_normals: Tensor) -> Tensor:
-    """The encoder's input: offsets (K, n, 3) in patch radii, nearest first, ... -> (K, PATCH_POINTS, CHANNELS).
+def describe_patches(
+    offsets: np.ndarray, valid: np.ndarray, normal: np.ndarray, neighbours: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """The encoder's input (K, PATCH_POINTS, CHANNELS), float32.
 
-    Channels: the position in the patch's frame, the products of the normal's components there (which have no sign to
-    guess), and the distance. The points taken are evenly spaced in the order of distance, so even over the patch.
+    offsets: (K, n, 3) in patch radii, nearest first; valid: (K, n); normal: (K, 3) at the keypoints; neighbours: (K, n)
+    rows of normals (M, 3). Channels: the position in the patch's frame, the products of the normal's components there
+    (which have no sign to guess), and the distance. The points taken are evenly spaced in the order of distance, so
+    even over the patch.
     """
-    frame = reference_frames(offsets, valid, normal)
-    count = valid.sum(1, keepdim=True).clamp_min(1)
-    steps = (torch.arange(PATCH_POINTS, device=offsets.device) + 0.5) / PATCH_POINTS
-    chosen = (steps * count).long()  # [K x PATCH_POINTS]
-    index = chosen[..., None].expand(-1, -1, 3)
-    p = offsets.gather(1, index) @ frame.mT
-    n = neighbour_normals.gather(1, index) @ frame.mT
-    products = torch.stack(
-        [
-            n[..., 0] ** 2, n[..., 1] ** 2, n[..., 2] ** 2,
-            n[..., 0] * n[..., 1], n[..., 0] * n[..., 2], n[..., 1] * n[..., 2],
-        ],
-        -1,
-    )  # fmt: skip
-    return torch.cat([p, products, p.norm(dim=-1, keepdim=True)], -1)
+    frame = np.swapaxes(reference_frames(offsets, valid, normal), 1, 2)
+    count = np.maximum(valid.sum(1, keepdims=True), 1)
+    chosen = ((np.arange(PATCH_POINTS, dtype=np.float32) + 0.5) / PATCH_POINTS * count).astype(int)  # [K x POINTS]
+    out = np.empty((*chosen.shape, CHANNELS), np.float32)
+    p = np.take_along_axis(offsets, chosen[..., None], 1) @ frame
+    n = normals[np.take_along_axis(neighbours, chosen, 1)] @ frame
+    out[..., :3], out[..., 3:6] = p, n * n
+    np.multiply(n[..., 0], n[..., 1], out=out[..., 6])
+    np.multiply(n[..., 0], n[..., 2], out=out[..., 7])
+    np.multiply(n[..., 1], n[..., 2], out=out[..., 8])
+    out[..., 9] = np.sqrt((p * p).sum(-1))
+    return out

@@ -15,104 +15,111 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from fmr_cli.feature_metric import se3
-from fmr_cli.feature_metric.encoder import Encoder, chain
-from fmr_cli.feature_metric.solver import capped, constrained_step
+from fmr_cli.feature_metric.fast import constrained_step
+from fmr_cli.feature_metric.motion import exp
 
 LAYERS = 3  # of the encoder: 64-64-64
 MIN_SHARE = 0.35  # of the target's points a ball must hold of the source
 SCALE_FROM, SCALE_TO = 3.0, 1.0  # the robust scale's factor over the iterations, times the median residual
 MAX_STEP = 0.5
+CHUNK = 16  # balls encoded at once: their activations stay in the processor's cache
 
-# (centres (P, 3)) -> offsets (P, n, 3) in radii, valid (P, n), how many points each ball holds (P,)
-Neighbourhoods = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
+Layers = list[tuple[np.ndarray, np.ndarray]]  # of an encoder: weight (out, in) and bias (out,) of each
+# (centres (P, 3)) -> offsets (P, n, 3) in radii, valid (P, n), float32: how the points lie in the balls
+Neighbourhoods = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass
 class PatchTemplate:
     """The target's side. centres (P, 3); feature (P, C); J (P, C, 6); JtJ (P, 6, 6); count (P,) points in each ball."""
 
-    centres: Tensor
-    feature: Tensor
-    J: Tensor
-    JtJ: Tensor
-    count: Tensor
+    centres: np.ndarray
+    feature: np.ndarray
+    J: np.ndarray
+    JtJ: np.ndarray
+    count: np.ndarray
 
 
 @dataclass
 class PatchFit:
-    """g (4, 4); error (P,) the patches' |r| at g, NaN where not co-occupied; weight (P,); information (6, 6) at g."""
+    """g (4, 4); error (P,) the patches' |r| at g, NaN where not co-occupied; weight (P,)."""
 
-    g: Tensor
-    error: Tensor
-    weight: Tensor
-    information: Tensor
-
-
-def patch_features(encoder: Encoder, offsets: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """F_c of every ball and the critical point of each channel: (P, n, 3), (P, n) -> (P, C), (P, C)."""
-    x = offsets
-    for layer in encoder.linear[:LAYERS]:
-        x = torch.relu_(layer(x))
-    window = (1 - offsets.square().sum(-1)).clamp_min(0) * valid
-    return (x * window[..., None]).max(1)
+    g: np.ndarray
+    error: np.ndarray
+    weight: np.ndarray
 
 
-def patch_template(encoder: Encoder, centres: Tensor, neighbourhoods: Neighbourhoods, radius: float) -> PatchTemplate:
+def pointwise(layers: Layers, offsets: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """(1 - |u|²) f(u) of every point of every ball: (P, n, 3), (P, n) -> (P, n, C)."""
+    x = offsets.reshape(-1, 3)
+    for weight, bias in layers[:LAYERS]:
+        x = x @ weight.T
+        x += bias
+        np.maximum(x, 0, out=x)
+    x = x.reshape(*offsets.shape[:2], -1)
+    x *= (np.maximum(1 - (offsets * offsets).sum(-1), 0) * valid)[..., None]
+    return x
+
+
+def patch_features(layers: Layers, offsets: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """F_c of every ball: (P, n, 3), (P, n) -> (P, C)."""
+    parts = [slice(i, i + CHUNK) for i in range(0, len(offsets), CHUNK)]
+    return np.concatenate([pointwise(layers, offsets[part], valid[part]).max(1) for part in parts])
+
+
+def patch_template(layers: Layers, centres: np.ndarray, look: Neighbourhoods, radius: float) -> PatchTemplate:
     """F_c and its exact Jacobian at the target; centres and radius in the target's normalised frame."""
-    offsets, valid, count = neighbourhoods(centres)
-    feature, index = patch_features(encoder, offsets, valid)
-    u = offsets.gather(1, index[..., None].expand(-1, -1, 3))  # [P x C x 3]
-    layers, on, x = encoder.linear[:LAYERS], [], u
-    for layer in layers[:-1]:
-        x = layer(x)
+    offsets, valid = look(centres)
+    values = pointwise(layers, offsets, valid)
+    index = values.argmax(1)  # [P x C], the critical points
+    feature = np.take_along_axis(values, index[:, None], 1)[:, 0]
+    u = np.take_along_axis(offsets, index[..., None], 1)  # [P x C x 3]
+    on, x = [], u
+    for weight, bias in layers[: LAYERS - 1]:
+        x = x @ weight.T + bias
         on.append(x > 0)
-        x = torch.relu(x)
-    slope = chain(layers, on)  # df/du before the last ReLU, which is on wherever the feature is above 0
-    value = (x * layers[-1].weight).sum(-1) + layers[-1].bias
+        x = np.maximum(x, 0)
+    weight, bias = layers[LAYERS - 1]
+    value = (x * weight).sum(-1) + bias
+    slope = weight  # df/du before the last ReLU, which is on wherever the feature is above 0
+    for (inner, _), mask in zip(reversed(layers[: LAYERS - 1]), reversed(on), strict=True):
+        slope = (slope * mask) @ inner
     # d[(1 - |u|²) f(u)]/du = (1 - |u|²) df/du - 2 u f
-    window = 1 - u.square().sum(-1, keepdim=True)
+    window = 1 - (u * u).sum(-1, keepdims=True)
     gradient = (window * slope - 2 * u * value[..., None]) / radius
     p = centres[:, None] + radius * u
-    J = -torch.cat([torch.linalg.cross(p, gradient), gradient], -1) * (feature > 0)[..., None]
-    return PatchTemplate(centres, feature, J, J.mT @ J, count)
+    J = -np.concatenate([np.cross(p, gradient), gradient], -1) * (feature > 0)[..., None]
+    return PatchTemplate(centres, feature, J, np.swapaxes(J, 1, 2) @ J, valid.sum(1))
 
 
 def refine(
-    encoder: Encoder,
+    layers: Layers,
     template: PatchTemplate,
-    neighbourhoods: Neighbourhoods,
-    g: Tensor,
+    look: Neighbourhoods,
+    g: np.ndarray,
     iterations: int,
-    basis: Tensor | None = None,
+    basis: np.ndarray | None = None,
 ) -> PatchFit:
-    """Iterate from g (4, 4), float64; ``neighbourhoods`` looks balls up in the source's own frame.
+    """Iterate from g (4, 4), float64; ``look`` finds the balls' points in the source's own frame.
 
     basis: (6, d) orthonormal twists that the motion may use; None for all six.
     """
     for iteration in range(iterations + 1):
-        inverse = torch.linalg.inv(g)
-        there = template.centres.double() @ inverse[:3, :3].T + inverse[:3, 3]
-        offsets, valid, count = neighbourhoods(there)
-        feature, _ = patch_features(encoder, offsets @ g[:3, :3].T.to(offsets), valid)
-        r = feature - template.feature
-        error = r.norm(dim=1)
-        occupied = count >= MIN_SHARE * template.count
-        if int(occupied.sum()) < 3:
-            nothing = torch.zeros_like(error)
-            return PatchFit(g, torch.full_like(error, torch.nan), nothing, torch.zeros(6, 6).double())
+        inverse = np.linalg.inv(g)
+        offsets, valid = look(template.centres @ inverse[:3, :3].T + inverse[:3, 3])
+        r = patch_features(layers, offsets @ g[:3, :3].T.astype(np.float32), valid) - template.feature
+        error = np.linalg.norm(r, axis=1)
+        occupied = valid.sum(1) >= MIN_SHARE * template.count
+        if occupied.sum() < 3:
+            return PatchFit(g, np.full_like(error, np.nan), np.zeros_like(error))
         fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * min(iteration / max(iterations - 1, 1), 1.0)
-        s2 = (fall * error[occupied].median()).square().clamp_min(1e-12)
-        weight = (s2 / (s2 + error.square())).square() * occupied
-        A = torch.einsum("p,pij->ij", weight, template.JtJ).double()
-        if iteration == iterations:
-            break
-        b = torch.einsum("p,pci,pc->i", weight, template.J, r).double()
-        step = constrained_step(A, b, basis)
-        g = se3.exp(capped(step, MAX_STEP)) @ g
-    # A per-channel variance from the weighted residuals turns J'WJ into an information matrix.
-    variance = (weight[:, None] * r.square()).sum().double() / (weight.sum().double() * r.shape[1]).clamp_min(1e-12)
-    return PatchFit(g, torch.where(occupied, error, torch.nan), weight, A / variance.clamp_min(1e-12))
+        s2 = max((fall * np.median(error[occupied])) ** 2, 1e-12)
+        weight = (s2 / (s2 + error**2)) ** 2 * occupied
+        if iteration < iterations:
+            A = np.tensordot(weight, template.JtJ, 1)
+            b = weight @ (r[:, None] @ template.J)[:, 0]
+            step = constrained_step(A, b, basis)
+            g = exp(step * min(MAX_STEP / max(float(np.linalg.norm(step)), 1e-30), 1.0)) @ g
+    return PatchFit(g, np.where(occupied, error, np.nan), weight)

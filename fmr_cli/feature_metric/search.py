@@ -1,4 +1,4 @@
-"""Any initial rotation: starts spread evenly over SO(3), solved as one batch, thinned out early, the best refined.
+"""Any initial rotation: starts spread evenly over SO(3), solved together, thinned out early, the best refined.
 
 J belongs to the target, so that all starts share it; a start costs only encoder passes over few points.
 """
@@ -7,60 +7,77 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.fast import Solution, Template
 from fmr_cli.feature_metric.motion import rotation_between
-from fmr_cli.feature_metric.solver import make_template, solve
 
 # 64 rotations leave none further than 60.4 deg from a start (30 on average); the solver's basin, measured, reaches 60.
 STARTS = 64
-COARSE_POINTS, COARSE_ITERATIONS = 256, 6
-KEPT, FINE_ITERATIONS = 6, 15
+# (points, iterations, distinct poses kept) of each round; the last takes all points.
+ROUNDS = ((128, 4, 16), (256, 5, 6), (None, 10, 6))
+KEPT = ROUNDS[-1][2]
 APART = math.radians(10.0)  # poses nearer than this are one
+
+
+class Solver(Protocol):
+    """F and the solver on it: ``fast.FastEncoder``, or ``solver.OnDevice`` on a GPU."""
+
+    def __call__(self, points: np.ndarray, /) -> np.ndarray: ...
+
+    def template(self, target: np.ndarray, threads: int = 1) -> Template: ...
+
+    def solve(
+        self,
+        template: Template,
+        source: np.ndarray,
+        g: np.ndarray,
+        iterations: int = 10,
+        robust: bool = True,
+        basis: np.ndarray | None = None,
+        threads: int = 1,
+    ) -> Solution: ...
 
 
 @dataclass
 class Found:
     """Distinct poses g (n, 4, 4), best first; their mean |r| (n,), and that of every iteration (i + 1, n)."""
 
-    g: Tensor
-    error: Tensor
-    errors: Tensor
+    g: np.ndarray
+    error: np.ndarray
+    errors: np.ndarray
 
 
 def search(
-    encoder: Encoder,
-    source: Tensor,
-    target: Tensor,
-    starts: Tensor,
+    solver: Solver,
+    source: np.ndarray,
+    target: np.ndarray,
+    starts: np.ndarray,
     robust: bool = True,
-    basis: Tensor | None = None,
+    basis: np.ndarray | None = None,
+    threads: int = 1,
 ) -> Found:
-    """Solve from every start (S, 4, 4); source (1, N, 3), target (1, M, 3) normalised, points in random order.
+    """Solve from every start (S, 4, 4); source (N, 3), target (M, 3) normalised, points in random order.
 
-    The coarse round uses the first COARSE_POINTS of both; the best KEPT are refined on all points.
+    The first rounds use the first points of both; what ends with a large error goes no further.
     """
-    starts = starts.to(source)
-    template = make_template(encoder, target[:, :COARSE_POINTS])
-    few = source[:, :COARSE_POINTS].expand(len(starts), -1, -1)
-    coarse = solve(encoder, template, few, starts, COARSE_ITERATIONS, robust, basis)
-    best = distinct(coarse.g, coarse.error, KEPT)
-    all_points = source.expand(len(best), -1, -1)
-    fine = solve(encoder, make_template(encoder, target), all_points, coarse.g[best], FINE_ITERATIONS, robust, basis)
-    order = distinct(fine.g, fine.error, KEPT)
-    return Found(fine.g[order], fine.error[order], fine.errors[:, order])
+    g = starts
+    for points, iterations, kept in ROUNDS:
+        template = solver.template(target[:points], threads)
+        found = solver.solve(template, source[:points], g, iterations, robust, basis, threads)
+        order = distinct(found.g, found.error, kept)
+        g = found.g[order]
+    return Found(g, found.error[order], found.errors[:, order])
 
 
-def distinct(g: Tensor, error: Tensor, count: int) -> Tensor:
+def distinct(g: np.ndarray, error: np.ndarray, count: int) -> list[int]:
     """Indices of the ``count`` poses of least error, no two within APART of each other."""
     kept: list[int] = []
-    for i in torch.argsort(error, stable=True).tolist():
-        R = g[i, :3, :3]
-        if all(float(rotation_between(R, g[j, :3, :3])) > APART for j in kept):
+    for i in np.argsort(error, kind="stable").tolist():
+        if all(rotation_between(g[i, :3, :3], g[j, :3, :3]) > APART for j in kept):
             kept.append(i)
         if len(kept) == count:
             break
-    return torch.tensor(kept)
+    return kept

@@ -13,18 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from fmr_cli.feature_metric import se3
+from fmr_cli.feature_metric import fast, se3
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
+from fmr_cli.feature_metric.fast import MAX_STEP, RANK_TOLERANCE, SCALE_FROM, SCALE_TO, STOP_STEP
 
 FINITE_STEP = 0.02  # the paper's
-MAX_STEP = 1.0  # rad, and units of the normalised cloud
-# Wide at first: channels that a large rotation moves are no outliers yet (from 4, success at 60 deg is 0.44, not 0.75).
-SCALE_FROM, SCALE_TO = 12.0, 0.7  # the robust scale's factor over the iterations, times the mean |r|
-STOP_STEP = 1e-7  # the float32 noise floor of a normalised cloud's feature
-RANK_TOLERANCE = 1e-9  # of the largest eigenvalue of JᵀJ
 
 
 @dataclass
@@ -132,3 +129,49 @@ def constrained_step(A: Tensor, b: Tensor, basis: Tensor | None) -> Tensor:
 def capped(step: Tensor, size: float) -> Tensor:
     """The step (..., 6), shortened where its norm exceeds ``size``."""
     return step * (size / step.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1.0)
+
+
+class OnDevice:
+    """A ``search.Solver``, numpy in and out, computed on the device of a torch encoder.
+
+    threads: of the CPU's solver; here without meaning.
+    """
+
+    def __init__(self, encoder: Encoder) -> None:
+        self.encoder, self.device = encoder, next(encoder.parameters()).device
+
+    def tensor(self, x: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(x, np.float32)).to(self.device)
+
+    @torch.inference_mode()
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """F: (N, 3) -> (K,)."""
+        return self.encoder(self.tensor(points)[None])[0].cpu().numpy()
+
+    @torch.inference_mode()
+    def template(self, target: np.ndarray, threads: int = 1) -> fast.Template:
+        """F(P) and its exact Jacobian: target (N, 3)."""
+        made = make_template(self.encoder, self.tensor(target)[None])
+        return fast.Template(made.feature[0].cpu().numpy(), made.J[0].cpu().numpy(), int(made.rank))
+
+    @torch.inference_mode()
+    def solve(
+        self,
+        template: fast.Template,
+        source: np.ndarray,
+        g: np.ndarray,
+        iterations: int = 10,
+        robust: bool = True,
+        basis: np.ndarray | None = None,
+        threads: int = 1,
+    ) -> fast.Solution:
+        """``solve`` from each g (S, 4, 4) on source (N, 3)."""
+        known = Template(
+            self.tensor(template.feature)[None],
+            torch.from_numpy(template.J)[None].to(self.device),
+            torch.tensor([template.rank], device=self.device),
+        )
+        points = self.tensor(source).expand(len(g), -1, -1)
+        twists = None if basis is None else torch.from_numpy(basis)
+        found = solve(self.encoder, known, points, self.tensor(g), iterations, robust, twists)
+        return fast.Solution(found.g.double().cpu().numpy(), found.errors.cpu().numpy(), template.rank)

@@ -5,7 +5,7 @@ The scenes know where both scanners stood, so every keypoint of one scan has its
 
 from __future__ import annotations
 
-import json
+import itertools
 import multiprocessing
 import sys
 import time
@@ -16,15 +16,34 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from torch import Tensor
+from torch import Tensor, nn
 
-from fmr_cli.feature_metric.local import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
+from fmr_cli.feature_metric.local import CHANNELS, NEIGHBOURS, PATCH_RADIUS, describe_patches
 from fmr_cli.preprocess import Surface, working_scale
 from fmr_cli.training import scenes
 
 TEMPERATURE = 0.07
 PER_PAIR = 128  # correspondences taken from a pair of scans
+LEAST = 500  # points of a scan, of which a crop may leave none
 APART = 3.0  # voxel edges: nearer places are not each other's negatives
+
+
+class LocalNet(nn.Module):
+    """``feature_metric.local.LocalEncoder`` as it is trained: (K, PATCH_POINTS, CHANNELS) -> (K, 32), unit length."""
+
+    def __init__(self, point: tuple[int, ...] = (64, 128, 128), head: tuple[int, ...] = (128, 32)) -> None:
+        super().__init__()
+        self.point = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((CHANNELS, *point)))
+        self.head = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((point[-1], *head)))
+
+    def forward(self, patches: Tensor) -> Tensor:
+        x = patches
+        for layer in self.point:
+            x = torch.relu(layer(x))
+        x = x.amax(-2)
+        for layer in self.head[:-1]:
+            x = torch.relu(layer(x))
+        return nn.functional.normalize(self.head[-1](x), dim=-1)
 
 
 @dataclass
@@ -68,8 +87,10 @@ def degrade(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def make_views(rng: np.random.Generator, count: int) -> Views | None:
     """Up to ``count`` corresponding patches of a fresh pair, or None where the two scans hardly share a surface."""
-    pair = [degrade(p, rng) for p in scan_pair(rng)]
-    if min(map(len, pair)) < 500:
+    pair: list[np.ndarray] = list(scan_pair(rng))
+    if min(map(len, pair)) >= LEAST:
+        pair = [degrade(p, rng) for p in pair]
+    if min(map(len, pair)) < LEAST:
         return None
     scales = [working_scale(p, rng) for p in pair]
     edge = max(max(v for v, _ in scales), max(s for _, s in scales)) * rng.uniform(0.8, 1.25)
@@ -83,7 +104,7 @@ def make_views(rng: np.random.Generator, count: int) -> Views | None:
         return None
     index = rng.permutation(index)[:count]
     a, b = (
-        describe_patches(**{k: torch.from_numpy(v) for k, v in s.patches(i, PATCH_RADIUS, NEIGHBOURS).items()})
+        torch.from_numpy(describe_patches(**s.patches(i, PATCH_RADIUS, NEIGHBOURS)))
         for s, i in ((source, index), (target, match[index]))
     )
     return Views(a, b, torch.from_numpy(where[index] / edge).float())
@@ -114,13 +135,13 @@ def make_material(pairs: int, seed: int, workers: int) -> list[Views]:
         return list(pool.map(pair_views, [(seed, i) for i in range(pairs)], chunksize=4))
 
 
-def train(material: list[Views], steps: int, seed: int, batch: int = 4) -> LocalEncoder:
+def train(material: list[Views], steps: int, seed: int, batch: int = 4) -> LocalNet:
     """Train for ``steps`` steps of ``batch`` pairs each (Adam 1e-3, cosine, bfloat16 products); logs to stderr."""
     rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
     start = time.time()
     held_out, material = material[: len(material) // 20], material[len(material) // 20 :]
-    model = LocalEncoder()
+    model = LocalNet()
     optimiser = torch.optim.Adam(model.parameters(), 1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for step in range(1, steps + 1):
@@ -141,21 +162,20 @@ def train(material: list[Views], steps: int, seed: int, batch: int = 4) -> Local
 
 
 @torch.no_grad()
-def held_out_rank1(model: LocalEncoder, views: Views) -> float:
+def held_out_rank1(model: LocalNet, views: Views) -> float:
     """How often the nearest descriptor among the other scan's is of the same place (within APART)."""
     best = (model(views.source) @ model(views.target).T).argmax(1)
     return float(((views.place[best] - views.place).norm(dim=1) < APART).float().mean())
 
 
-def main(out: str, pairs: int = 320, steps: int = 1600, seed: int = 0) -> None:
+def main(out: str, pairs: int = 480, steps: int = 2400, seed: int = 0) -> None:
     """``python -m fmr_cli.training.local models/local.safetensors``: the bundled local encoder, from code alone."""
     from safetensors.torch import save_file
 
     material = make_material(pairs, seed, workers=multiprocessing.cpu_count())
     torch.set_num_threads(1)
     model = train(material, steps, seed)
-    widths = {"point_widths": list(model.point_widths), "head_widths": list(model.head_widths)}
-    save_file(model.state_dict(), out, metadata={"architecture": json.dumps(widths)})
+    save_file(model.state_dict(), out)
 
 
 if __name__ == "__main__":

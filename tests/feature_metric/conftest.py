@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.fast import FastEncoder
 from fmr_cli.training.shapes import shapes
-from fmr_cli.weights import bundled_encoder
+from fmr_cli.weights import bundled_encoder, bundled_path
 
 
 @pytest.fixture(scope="session")
@@ -29,3 +31,22 @@ def exact_encoder(encoder: Encoder) -> Encoder:
 def bodies() -> Tensor:
     """(12, 1024, 3) shapes that no training run drew, normalised, points in random order."""
     return torch.from_numpy(shapes(12, 1024, seed=20_000))
+
+
+@pytest.fixture(scope="session")
+def fast() -> FastEncoder:
+    """The bundled encoder without torch."""
+    with bundled_path() as path:
+        return FastEncoder.load(path)
+
+
+@pytest.fixture(scope="session")
+def bodies_numpy(bodies: Tensor) -> np.ndarray:
+    return bodies.numpy()
+
+
+@pytest.fixture(scope="session")
+def room(room_scans: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """A scan (12000, 3) of a procedural room, normalised as the encoder takes it, float32, in random order."""
+    points = room_scans[0] - room_scans[0].mean(0)
+    return (points / (2 * np.abs(points).max())).astype(np.float32)

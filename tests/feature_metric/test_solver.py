@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ def turns(count: int, degrees: float, shift: float = 0.0, seed: int = 0) -> Tens
 
 
 def degrees_off(g: Tensor, T: Tensor) -> Tensor:
-    return torch.rad2deg(rotation_between(g[:, :3, :3].double(), T[:, :3, :3].double()))
+    return torch.from_numpy(np.degrees(rotation_between(g[:, :3, :3].double().numpy(), T[:, :3, :3].double().numpy())))
 
 
 def identity(count: int) -> Tensor:
@@ -57,7 +58,7 @@ def test_every_iteration_s_error_is_kept_and_the_end_is_early(encoder: Encoder, 
     assert torch.equal(solve(encoder, template, source, T, iterations=0).g, T)
 
 
-def test_robust_weights_bear_missing_parts_that_plain_least_squares_does_not(encoder: Encoder) -> None:
+def test_missing_parts_pull_robust_weights_off_less_than_plain_least_squares(encoder: Encoder) -> None:
     clouds = torch.from_numpy(shapes(16, 1024, seed=30_000))
     side = torch.randn(16, 3, 1, generator=torch.Generator().manual_seed(5))
     order = (clouds @ side)[..., 0].argsort(1)[..., None].expand(-1, -1, 3)
@@ -67,8 +68,7 @@ def test_robust_weights_bear_missing_parts_that_plain_least_squares_does_not(enc
     source, template = se3.transform(torch.linalg.inv(T), second[:, ::2]), make_template(encoder, first[:, 1::2])
     robust, plain = (degrees_off(solve(encoder, template, source, identity(16), 10, r).g, T) for r in (True, False))
     assert (robust < 5).float().mean() >= 0.8
-    assert (robust < 5).sum() > (plain < 5).sum()
-    assert robust.median() < plain.median()
+    assert robust.median() < 0.6 * plain.median()
 
 
 def test_what_a_point_or_a_line_does_not_determine_shows_in_the_rank_and_stays(encoder: Encoder) -> None:
@@ -97,7 +97,9 @@ def test_a_constrained_motion_never_leaves_its_subgroup(
 ) -> None:
     source = se3.transform(turns(4, 20, 0.1), bodies[:4, :256])  # which no constrained motion undoes
     motion = Motion(dof, up)  # type: ignore[arg-type]
-    g = solve(encoder, make_template(encoder, bodies[:4, :256]), source, identity(4), basis=motion.basis()).g
+    g = solve(
+        encoder, make_template(encoder, bodies[:4, :256]), source, identity(4), basis=torch.from_numpy(motion.basis())
+    ).g
     axis = torch.tensor(up)
     assert (g - torch.eye(4)).abs().max() > 0.01
     assert torch.equal(g[:, :3, :3] @ axis, axis.expand(4, 3))
@@ -110,10 +112,10 @@ def test_a_constrained_motion_never_leaves_its_subgroup(
 def test_a_tilted_axis_is_kept_to_float32_rounding(encoder: Encoder, bodies: Tensor) -> None:
     up = (0.36, 0.48, 0.8)
     axis = torch.tensor(up)
-    T = Motion("yaw", up).starts(24)[1:2].float()  # 15 deg about up
+    T = torch.from_numpy(Motion("yaw", up).starts(24)[1:2]).float()  # 15 deg about up
     source = se3.transform(torch.linalg.inv(T), bodies[:1])
     template = make_template(encoder, bodies[:1])
-    g = solve(encoder, template, source, identity(1), basis=Motion("yaw", up).basis()).g
+    g = solve(encoder, template, source, identity(1), basis=torch.from_numpy(Motion("yaw", up).basis())).g
     assert (g[0, :3, :3] @ axis - axis).abs().max() < 1e-6
     assert degrees_off(g, T).item() < 0.05
 

@@ -1,0 +1,203 @@
+"""What the benchmarks share: clouds, the paper's protocols, the tools a user would pick instead, tables and clocks."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
+from fmr_cli.io import SUFFIXES, read_cloud
+from fmr_cli.registration import Options, align
+from fmr_cli.training import scenes
+from fmr_cli.training.shapes import shapes
+
+Way = Callable[[np.ndarray, np.ndarray], np.ndarray]  # source (N, 3), target (M, 3) -> T_target_source
+
+PROTOCOLS = ("copy", "so3", "resample", "noise", "density", "overlap90", "overlap80", "overlap70")
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+console = Console(width=150, highlight=False)
+
+
+def room_clouds(count: int, points: int, seed: int) -> list[np.ndarray]:
+    """Scans (points, 3) of that many procedural rooms by a depth camera, metres, in random order."""
+    clouds = []
+    for number in range(count):
+        rng = np.random.default_rng((seed, number))
+        room = scenes.room(rng)
+        views: list[np.ndarray] = []
+        while sum(map(len, views)) < points:
+            views.append(scenes.room_scan(room, rng, np.array([*rng.normal(0, 0.3, 2), 1.4]), rng.uniform(0, 6.3)))
+        clouds.append(rng.permutation(np.concatenate(views))[:points])
+    return clouds
+
+
+def shape_clouds(count: int, points: int, seed: int) -> list[np.ndarray]:
+    """Procedural objects (points, 3) of half extent 1."""
+    return list(2.0 * shapes(count, points, seed).astype(float))
+
+
+def folder_clouds(folder: Path, points: int | None, seed: int) -> list[np.ndarray]:
+    """Every file of the folder that can be read, at most ``points`` of its points, in random order."""
+    rng = np.random.default_rng(seed)
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.endswith(".pose.txt"))
+    return [rng.permutation(read_cloud(p, attributes=False).points)[:points] for p in files]
+
+
+def random_pose(rng: np.random.Generator, degrees: float | None, shift: float) -> np.ndarray:
+    """A rotation of up to ``degrees`` about any axis (None: uniform in SO(3)) and a shift of up to ``shift``."""
+    axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    turn = Rotation.random(random_state=rng)
+    if degrees is not None:
+        turn = Rotation.from_rotvec(axis * np.radians(rng.uniform(0, degrees)))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turn.as_matrix(), direction * rng.uniform(0, shift)
+    return T
+
+
+def make_pair(protocol: str, points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Source, target and T_target_source of a cloud, which is turned by up to 60 deg and shifted by up to 1.
+
+    copy: the same points; so3: turned by any rotation; resample: disjoint random halves; noise: these, with 1 % of the
+    largest half extent; density: the source keeps 10 %; overlapNN: disjoint halves with NN % in common.
+    """
+    source = target = points
+    if protocol in ("resample", "noise") or protocol.startswith("overlap"):
+        order = rng.permutation(len(points))
+        source, target = points[order[::2]], points[order[1::2]]
+    if protocol.startswith("overlap"):
+        keep, side = int(protocol[-2:]) / 100, rng.normal(size=3)
+        low, high = np.quantile(points @ side, [(1 - keep) / (2 - keep), 1 / (2 - keep)])
+        source, target = source[source @ side >= low], target[target @ side <= high]
+    if protocol == "density":
+        source = source[rng.permutation(len(source))[: len(source) // 10]]
+    if protocol == "noise":
+        sigma = 0.01 * np.abs(points - points.mean(0)).max()
+        source, target = (x + rng.normal(size=x.shape) * sigma for x in (source, target))
+    T = random_pose(rng, None if protocol == "so3" else 60.0, 1.0)
+    return source, transform_points(T, target), T
+
+
+def pose_error(found: np.ndarray, truth: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+    """Degrees, and how far the moved centre lies from where it belongs."""
+    off = transform_points(found, centre[None]) - transform_points(truth, centre[None])
+    return angle_degrees(np.linalg.inv(truth) @ found), float(np.linalg.norm(off))
+
+
+def ways(voxel: float, reach: float) -> dict[str, Way]:
+    """fmr and the peers that are installed, each end to end; voxel edge and GICP's reach are the peers'."""
+    found: dict[str, Way] = {
+        "fmr": lambda source, target: align(PointCloud(source), PointCloud(target), Options(), CORES).T_target_source
+    }
+    try:
+        import small_gicp
+    except ImportError as error:
+        console.print(f"peers: skipped ({error})")
+        return found
+
+    def refine(source: np.ndarray, target: np.ndarray, T: np.ndarray) -> np.ndarray:
+        return small_gicp.align(
+            target, source, T, registration_type="GICP", downsampling_resolution=voxel,
+            max_correspondence_distance=reach, num_threads=CORES,
+        ).T_target_source  # fmt: skip
+
+    def refined(begin: Way, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return refine(source, target, begin(source, target))
+
+    for name, start in (("KISS-Matcher", kiss_matcher), ("FPFH + RANSAC", fpfh_ransac)):
+        try:
+            begin = start(voxel)
+        except (ImportError, OSError) as error:
+            console.print(f"{name}: skipped ({error})")
+            continue
+        found[f"{name} + small_gicp"] = partial(refined, begin)
+    found["small_gicp from the identity"] = lambda source, target: refine(source, target, np.eye(4))
+    return found
+
+
+def kiss_matcher(voxel: float) -> Way:
+    import kiss_matcher as km
+
+    def run(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        matcher = km.KISSMatcher(km.KISSMatcherConfig(voxel))
+        found = matcher.estimate(source.astype(np.float32), target.astype(np.float32))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = found.rotation, np.ravel(found.translation)
+        return T
+
+    return run
+
+
+def fpfh_ransac(voxel: float) -> Way:
+    import open3d as o3d
+
+    reg = o3d.pipelines.registration
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
+
+    def describe(points: np.ndarray) -> tuple[Any, Any]:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
+        return cloud, reg.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(5 * voxel, 100))
+
+    def run(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        (s, fs), (t, ft) = describe(source), describe(target)
+        checks = [
+            reg.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+            reg.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
+        ]
+        return np.array(
+            reg.registration_ransac_based_on_feature_matching(
+                s, t, fs, ft, True, 1.5 * voxel, reg.TransformationEstimationPointToPoint(False), 3, checks,
+                reg.RANSACConvergenceCriteria(100_000, 0.999),
+            ).transformation
+        )  # fmt: skip
+
+    return run
+
+
+def interleaved(runs: Mapping[str, Callable[[], Any]], repeats: int, warm: bool = False) -> dict[str, list[float]]:
+    """Seconds of each run, one after the other in every round so that all see the machine alike.
+
+    warm: each has run before; else a first round does not count.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(repeats + (not warm)):
+        for name, run in runs.items():
+            begin = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - begin)
+    return {name: all_[-repeats:] for name, all_ in seconds.items()}
+
+
+def show(title: str, rows: list[dict[str, Any]]) -> None:
+    """The rows as a table; a column for each key."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    table = Table(*columns, title=title, title_justify="left")
+    for row in rows:
+        cells = (row.get(column, "") for column in columns)
+        table.add_row(*(f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in cells))
+    console.print(table)
+
+
+def save(out: Path | None, report: dict[str, Any], draw: Callable[[Any], None]) -> None:
+    """OUT.json with the report, and OUT.png where matplotlib is installed; draw(figure)."""
+    if out is None:
+        return
+    out.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        console.print(f"plot: skipped ({error})")
+        return
+    figure = Figure((13, 4.6), layout="constrained")
+    draw(figure)
+    figure.savefig(out.with_suffix(".png"), dpi=120)

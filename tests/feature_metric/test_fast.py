@@ -1,0 +1,112 @@
+"""The solver without torch says what the plain one says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from fmr_cli.cloud import transform_points
+from fmr_cli.feature_metric.encoder import Encoder, jacobian
+from fmr_cli.feature_metric.fast import LARGE, FastEncoder
+from fmr_cli.feature_metric.motion import Motion, exp
+from fmr_cli.feature_metric.solver import OnDevice
+
+START = np.eye(4)[None]
+
+
+def pair(cloud: np.ndarray, kind: str, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """Source and target of a cloud (N, 3): the same points, or halves drawn apart, or these with noise."""
+    rng = np.random.default_rng(3)
+    source = target = cloud
+    if kind != "copy":
+        source, target = cloud[::2], cloud[1::2]
+    if kind == "noise":
+        source, target = (x + rng.normal(size=x.shape) * 0.005 for x in (source, target))
+    axis = rng.normal(size=3)
+    T = exp(np.concatenate([np.radians(degrees) * axis / np.linalg.norm(axis), [0.03, -0.02, 0.05]]))
+    return transform_points(np.linalg.inv(T), source).astype(np.float32), target.astype(np.float32)
+
+
+def test_no_torch_is_imported() -> None:
+    code = "import sys, fmr_cli.feature_metric.search; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_feature_and_critical_points_are_those_of_the_encoder(
+    fast: FastEncoder, encoder: Encoder, room: np.ndarray
+) -> None:
+    feature, index = fast.encode(room)
+    expected, where = encoder.encode(torch.from_numpy(room)[None])
+    np.testing.assert_allclose(feature, expected[0], rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(fast(room), feature)
+    values = encoder.pointwise(torch.from_numpy(room[index])).diagonal()
+    np.testing.assert_allclose(values, expected[0], rtol=0, atol=1e-5)  # another point only where two are equal
+    assert (index == where[0].numpy()).mean() > 0.99
+
+
+def test_the_jacobian_is_the_exact_one(fast: FastEncoder, encoder: Encoder, room: np.ndarray) -> None:
+    _, index = fast.encode(room)
+    expected = jacobian(encoder, torch.from_numpy(room)[None], torch.from_numpy(index)[None])[0]
+    np.testing.assert_allclose(fast.template(room).J, expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("kind", ["copy", "resample", "noise"])
+@pytest.mark.parametrize("degrees", [5, 50])
+def test_the_pose_of_the_plain_solver(
+    fast: FastEncoder, encoder: Encoder, room: np.ndarray, kind: str, degrees: float, robust: bool
+) -> None:
+    source, target = pair(room[:3000], kind, degrees)
+    plain = OnDevice(encoder)
+    expected = plain.solve(plain.template(target), source, START, 10, robust)
+    found = fast.solve(fast.template(target), source, START, 10, robust)
+    np.testing.assert_allclose(found.g, expected.g, rtol=0, atol=2e-5)
+    both = min(len(found.errors), len(expected.errors))  # the end of a copy may come an iteration sooner or later
+    np.testing.assert_allclose(found.errors[:both], expected.errors[:both], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("kind", ["copy", "resample", "noise"])
+def test_few_of_many_points_lead_to_the_pose_of_all(
+    fast: FastEncoder, encoder: Encoder, room: np.ndarray, kind: str, robust: bool
+) -> None:
+    source, target = pair(room, kind, 40)
+    assert len(source) >= LARGE
+    plain = OnDevice(encoder)
+    expected = plain.solve(plain.template(target), source, START, 15, robust)
+    found = fast.solve(fast.template(target), source, START, 15, robust)
+    np.testing.assert_allclose(found.g, expected.g, rtol=0, atol=1e-6 if kind == "copy" else 1e-3 if robust else 1e-4)
+    moved = transform_points(found.g[0], source).astype(np.float32)
+    everything = np.abs(fast(moved) - fast(target)).mean()
+    np.testing.assert_allclose(found.error, everything, rtol=0, atol=1e-6)  # the last error is that of all points
+
+
+def test_threads_change_no_bit(fast: FastEncoder, room: np.ndarray) -> None:
+    source, target = pair(room, "resample", 30)
+    one, two = (fast.solve(fast.template(target, n), source, START, threads=n) for n in (1, 2))
+    assert (one.g == two.g).all()
+    assert (one.errors == two.errors).all()
+
+
+def test_constrained_and_many_starts(fast: FastEncoder, encoder: Encoder, room: np.ndarray) -> None:
+    motion, plain = Motion("yaw"), OnDevice(encoder)
+    starts = motion.starts(0)[:5]
+    target, source = room[:256], room[256:512]
+    found = fast.solve(fast.template(target), source, starts, 6, True, motion.basis())
+    expected = plain.solve(plain.template(target), source, starts, 6, True, motion.basis())
+    np.testing.assert_allclose(found.g, expected.g, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(found.g[:, 2, :3], np.tile([0.0, 0.0, 1.0], (5, 1)))
+
+
+def test_what_a_point_or_a_line_does_not_determine_shows_in_the_rank_and_stays(fast: FastEncoder) -> None:
+    point = np.full((100, 3), 0.3, np.float32)
+    line = (np.linspace(-0.5, 0.5, 100)[:, None] * [0.6, 0.0, 0.8] + [0.0, 0.1, 0.0]).astype(np.float32)
+    for target, rank in ((point, 3), (line, 5)):
+        found = fast.solve(fast.template(target), target + np.float32(0.01), START)
+        assert found.rank == rank
+        np.testing.assert_allclose(transform_points(found.g[0], target + 0.01), target, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(found.g[0, :3, :3], np.eye(3), rtol=0, atol=0.01)

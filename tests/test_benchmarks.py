@@ -1,0 +1,90 @@
+"""The benchmarks run, and measure what they say. No times are asserted."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import paper, speed
+from benchmarks.common import PROTOCOLS, interleaved, make_pair, pose_error, room_clouds
+from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.feature_metric.motion import exp
+from fmr_cli.io import write_cloud
+from fmr_cli.weights import bundled_encoder
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(module: str, *arguments: str) -> str:
+    command = [sys.executable, "-m", module, *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_truth_of_a_pair_is_exact(protocol: str) -> None:
+    cloud = room_clouds(1, 2000, 0)[0]
+    source, target, T = make_pair(protocol, cloud, np.random.default_rng(1))
+    back = transform_points(np.linalg.inv(T), target)
+    assert pose_error(T, T, source.mean(0)) == pytest.approx((0, 0), abs=1e-5)
+    if protocol in ("copy", "so3", "density"):
+        assert len(np.unique(np.round(np.concatenate([source, back]), 9), axis=0)) == len(back)
+    if protocol == "density":
+        assert len(source) == len(target) // 10
+    if protocol.startswith("overlap"):
+        assert len(source) == pytest.approx(len(target), rel=0.15)
+        assert len(source) < 1000  # a half that lacks one end
+    if protocol != "so3":
+        assert pose_error(T, np.eye(4), np.zeros(3))[0] <= 60
+
+
+def test_the_paper_s_algorithm_finds_the_pose() -> None:
+    cloud = room_clouds(1, 3000, 3)[0]
+    points = ((cloud - cloud.mean(0)) / (2 * np.abs(cloud - cloud.mean(0)).max())).astype(np.float32)
+    T = exp(np.array([0.2, 0.1, -0.3, 0.02, 0.01, 0.03]))
+    source = transform_points(np.linalg.inv(T), points).astype(np.float32)
+    for normalised in (False, True):
+        net = paper.PointNet(bundled_encoder(), normalised)
+        found = paper.solve(net, torch.from_numpy(source)[None], torch.from_numpy(points)[None])
+        np.testing.assert_allclose(found[0], T, rtol=0, atol=1e-4)
+
+
+def test_runs_take_turns() -> None:
+    order: list[str] = []
+    seconds = interleaved({name: lambda name=name: order.append(name) for name in "ab"}, 2)  # type: ignore[misc]
+    assert "".join(order) == "ababab"
+    assert [len(s) for s in seconds.values()] == [2, 2]
+
+
+def test_ic_is_compared_at_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speed, "CORES", 1)
+    rows = speed.ic(speed.Setup(room_clouds(1, 1000, 2), 0.05, 1, 1, 1, [], 0))
+    assert rows[0]["times faster"] == 1
+    assert all(row["off, deg"] < 0.01 for row in rows)
+
+
+def test_speed_writes_a_report_and_a_plot(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    small = ["--points", "1000", "--clouds", "1", "--las-points", "3000"]
+    said = run("benchmarks.speed", "--only", "las", *small, "--out", str(tmp_path / "speed"))
+    assert "reading them alone" in said
+    assert json.loads((tmp_path / "speed.json").read_text())["las"][0]["GiB"] > 0
+    assert (tmp_path / "speed.png").stat().st_size > 1000
+
+
+def test_accuracy_of_a_folder(tmp_path: Path) -> None:
+    for number, cloud in enumerate(room_clouds(2, 1500, 1)):
+        write_cloud(tmp_path / f"{number}.ply", PointCloud(cloud))
+    few = ["--pairs", "2", "--only", "copy"]
+    said = run("benchmarks.accuracy", "--data", str(tmp_path), *few, "--out", str(tmp_path / "a"))
+    assert "2 clouds of 1,500 points" in said
+    rows = json.loads((tmp_path / "a.json").read_text())["rows"]
+    assert rows[0]["method"] == "fmr"
+    assert rows[0]["recall"] == 1.0
