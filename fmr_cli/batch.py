@@ -8,7 +8,7 @@ import os
 import re
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -100,10 +100,14 @@ class Loaded:
 
 
 class Clouds:
-    """Files read and prepared, each once even when several threads ask for it; the least recently used are let go."""
+    """Files read and prepared, each once even when several threads ask for it.
+
+    A file is let go once no pair needs it any more, and the least recently used where many are kept.
+    """
 
     def __init__(self, *, keep: bool, seed: int) -> None:
         self.keep, self.seed = keep, seed
+        self.needed: Counter[Path] = Counter()  # how many pairs are still to come that need it
         self.files: OrderedDict[Path, Future[Loaded]] = OrderedDict()
         self.lock = threading.Lock()
 
@@ -121,6 +125,14 @@ class Clouds:
                 future.set_exception(error)
             self.let_go()
         return future.result()
+
+    def done_with(self, *paths: Path) -> None:
+        """A pair of these files is done."""
+        with self.lock:
+            self.needed.subtract(paths)
+            for path in paths:
+                if self.needed[path] <= 0:
+                    self.files.pop(path, None)
 
     def let_go(self) -> None:
         with self.lock:
@@ -182,6 +194,7 @@ class Batch:
         """Registers the pairs from index ``first`` on; yields each row, in the manifest's order, once it is on disk."""
         with (self.out / "results.csv").open("a", newline="", encoding="utf-8") as file:
             table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            self.clouds.needed.update(self.folder / name for p in self.pairs[first:] for name in (p.source, p.target))
             pool = ThreadPoolExecutor(workers)
             try:
                 todo, waiting = iter(self.pairs[first:]), deque[Future[dict[str, Any]]]()
@@ -224,6 +237,8 @@ class Batch:
             row |= {"status": "failed", "message": " ".join(str(error).split())}
         except Exception as error:  # whatever one pair runs into, the others go on
             row |= {"status": "failed", "message": f"{type(error).__name__}: {reason(error)}"}
+        finally:
+            self.clouds.done_with(self.folder / pair.source, self.folder / pair.target)
         return row | {"seconds": f"{time.perf_counter() - start:.3f}"}
 
     def write_clouds(

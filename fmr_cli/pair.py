@@ -37,6 +37,7 @@ CHANCE_POSES = 8
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128
 POLISH_TARGET, POLISH_SOURCE = 24_000, 8_000
 EXACT_TARGET = 200_000  # points of the target that the winner is polished against once more, each its own
+FINER = 4.0  # times the grid of the last polish of large clouds, where they are dense enough
 COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
 POLISH_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
 SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxels
@@ -177,12 +178,12 @@ class Pair:
     @cached_property
     def feature(self) -> np.ndarray:
         """F(P) of the target."""
-        return self.encoder(self.P)
+        return self.encoder(self.P, self.threads)
 
     @cached_property
     def template(self) -> Template:
         """The global feature of the target, and its Jacobian."""
-        return self.encoder.template(self.P)
+        return self.encoder.template(self.P, self.threads)
 
     # Between the local frames and the encoder's: x -> (x - origin) / length.
 
@@ -342,23 +343,35 @@ class Pair:
         return polish.gicp(polish.GicpCloud(near, self.edge, self.threads), target, T, self.edge)
 
     def exact(self, T: np.ndarray) -> np.ndarray:
-        """The pose after a polish on the points themselves, where the one before saw a share or a grid of them.
+        """The pose after a polish on more than the one before saw, where there is more.
 
-        Only where the scans have points in common, which then come to coincide; otherwise a grid is the better mean.
+        Scans that have points in common come to coincide, point by point; otherwise a grid is the better mean, of
+        large scans a finer one.
         """
-        if self.motion.dof != "rigid" or not POLISH_TARGET < len(self.target.points) <= 4 * EXACT_TARGET:
+        if self.motion.dof != "rigid" or len(self.target.points) <= POLISH_TARGET:
             return T
+        if len(self.target.points) <= 4 * EXACT_TARGET and self.in_common(T):
+            source = sample(self.source.points, POLISH_SOURCE, np.random.default_rng(self.seed))
+            return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, self.threads, own=True), T)
+        fine = max(self.edge / FINER, SPACINGS * self.source.spacing, SPACINGS * self.target.spacing)
+        if min(len(self.source.points), len(self.target.points)) < EXACT_TARGET or fine > self.edge / 2:
+            return T
+        s, t = (x.surface(fine).points for x in (self.source, self.target))
+        some = sample(s, POLISH_SOURCE, np.random.default_rng(self.seed))
+        source_cloud, target_cloud = (polish.GicpCloud(x, fine, self.threads) for x in (some, t))
+        return polish.gicp(source_cloud, target_cloud, T, fine)
+
+    def in_common(self, T: np.ndarray) -> bool:
+        """Whether most of a few points of the source have their like in the target at T."""
         some = sample(self.source.points, RANKING_POINTS, np.random.default_rng(self.seed)) @ T[:3, :3].T + T[:3, 3]
         tree = cKDTree(self.target.points, balanced_tree=False, compact_nodes=False)
-        if np.median(tree.query(some, distance_upper_bound=self.edge)[0]) > COMMON * self.target.spacing:
-            return T
-        source = sample(self.source.points, POLISH_SOURCE, np.random.default_rng(self.seed))
-        return self.gicp(source, self.target.for_gicp(EXACT_TARGET, self.edge, self.threads, own=True), T)
+        distance = tree.query(some, distance_upper_bound=self.edge)[0]
+        return bool(np.median(distance) <= COMMON * self.target.spacing)
 
     def feature_error(self, T: np.ndarray) -> float:
         """Mean |F(T Q) - F(P)| of the global feature at a pose."""
         g = self.normalised(T).astype(np.float32)
-        return float(np.abs(self.encoder(self.Q @ g[:3, :3].T + g[:3, 3]) - self.feature).mean())
+        return float(np.abs(self.encoder(self.Q @ g[:3, :3].T + g[:3, 3], self.threads) - self.feature).mean())
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:
