@@ -60,9 +60,10 @@ def plot(figure: Any, rows: list[dict[str, Any]]) -> None:
     """A panel for each set of clouds: recall by protocol, a line for each method."""
     sets = list(dict.fromkeys(row["clouds"] for row in rows))
     for axis, name in zip(figure.subplots(1, len(sets), squeeze=False)[0], sets, strict=True):
-        for method in dict.fromkeys(row["method"] for row in rows):
+        for place, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
             own = [row for row in rows if (row["clouds"], row["method"]) == (name, method)]
-            axis.plot([row["protocol"] for row in own], [row["recall"] for row in own], "o-", label=method)
+            recall = [row["recall"] for row in own]
+            axis.plot([row["protocol"] for row in own], recall, "o-", label=method, zorder=9 - place)  # fmr in front
         axis.set(title=name, ylim=(-0.03, 1.03), ylabel=f"recall ({DEGREES:g} deg, {SHIFT:g})")
         axis.tick_params(axis="x", rotation=40)
     axis.legend(fontsize="small", loc="lower left")
