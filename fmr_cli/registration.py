@@ -9,7 +9,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from threadpoolctl import ThreadpoolController
 import fmr_cli
 from fmr_cli import polish, verdict
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
-from fmr_cli.errors import FmrError
+from fmr_cli.errors import FmrError, RegistrationError
 from fmr_cli.feature_metric.motion import Dof, Motion
 from fmr_cli.pair import KEYPOINTS, Candidate, Pair, Prepared, Start, pair_edge
 from fmr_cli.weights import bundled_local_encoder, fast_encoder, solver
@@ -213,10 +213,11 @@ def look(
     """The candidates, best first, and the pair that they were found on: a coarse one where that leaves no doubt."""
     auto = isinstance(options.init, str) and options.init == "auto"
     if auto and options.voxel_size is None and not options.scale:
-        pair = make_pair(source, target, options, threads, coarse=True)
-        candidates = find(pair, replace(options, init="features"), seconds)
-        if candidates[0].confidence >= SURE:
-            return pair, candidates
+        with suppress(RegistrationError):  # too few voxels of that size
+            pair = make_pair(source, target, options, threads, coarse=True)
+            candidates = find(pair, replace(options, init="features"), seconds)
+            if candidates[0].confidence >= SURE:
+                return pair, candidates
     pair = make_pair(source, target, options, threads)
     return pair, find(pair, options, seconds)
 
