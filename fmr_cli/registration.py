@@ -29,8 +29,9 @@ from fmr_cli.weights import bundled_local_encoder, fast_encoder, solver
 
 Init = Literal["auto", "search", "features", "centroid", "identity"]
 REFINED = 3  # starts that are refined, of each kind
-SURE, RIVAL = 0.95, 0.8  # once a pose is that sure, only starts that coincide nearly as much are looked at
-SETTLED = 0.8  # once a pose is that sure, no other kind of start is tried
+SURE = 0.95  # once a pose is that sure on coarse voxels, fine ones are not looked at
+SETTLED = 0.8  # once a pose is that sure, no other kind of start is tried, and of its own kind only
+RIVAL = 0.8  # those that coincide nearly as much
 COARSE, COARSE_KEYPOINTS = 1.5, 250  # a first look on larger voxels, at fewer places, which is often sure already
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
@@ -215,7 +216,7 @@ def look(
     if auto and options.voxel_size is None and not options.scale:
         with suppress(RegistrationError):  # too few voxels of that size
             pair = make_pair(source, target, options, threads, coarse=True)
-            candidates = find(pair, replace(options, init="features"), seconds)
+            candidates = find(pair, replace(options, init="features"), seconds, refined=1)
             if candidates[0].confidence >= SURE:
                 return pair, candidates
     pair = make_pair(source, target, options, threads)
@@ -240,7 +241,7 @@ def make_pair(source: Prepared, target: Prepared, options: Options, threads: int
     )  # fmt: skip
 
 
-def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candidate]:
+def find(pair: Pair, options: Options, seconds: dict[str, float], refined: int = REFINED) -> list[Candidate]:
     """Candidates, best first, from the starts that the options name; "auto" goes on while none is settled."""
     candidates: list[Candidate] = []
     with stage(seconds, "describe"):
@@ -252,7 +253,7 @@ def find(pair: Pair, options: Options, seconds: dict[str, float]) -> list[Candid
             )
         with stage(seconds, "refine"):
             for i, (coincidence, start) in enumerate(ranked):
-                enough = i >= REFINED or (candidates and candidates[0].confidence >= SURE)
+                enough = i >= refined or (candidates and candidates[0].confidence >= SETTLED)
                 if enough and coincidence < RIVAL * ranked[0][0]:
                     break
                 candidate = pair.candidate(start, options.refine, options.scale)
