@@ -113,7 +113,7 @@ def ways(voxel: float, reach: float) -> dict[str, Way]:
     def refined(begin: Way, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         return refine(source, target, begin(source, target))
 
-    for name, start in (("KISS-Matcher", kiss_matcher), ("FPFH + RANSAC", fpfh_ransac)):
+    for name, start in PEERS.items():
         try:
             begin = start(voxel)
         except (ImportError, OSError) as error:
@@ -162,6 +162,9 @@ def fpfh_ransac(voxel: float) -> Way:
         )  # fmt: skip
 
     return run
+
+
+PEERS = {"KISS-Matcher": kiss_matcher, "FPFH + RANSAC": fpfh_ransac}  # given a voxel edge, they import their library
 
 
 def interleaved(runs: Mapping[str, Callable[[], Any]], repeats: int, warm: bool = False) -> dict[str, list[float]]:

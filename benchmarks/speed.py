@@ -42,10 +42,9 @@ from benchmarks.common import (
     ways,
 )
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
-from fmr_cli.feature_metric.fast import FastEncoder
 from fmr_cli.io import write_cloud
 from fmr_cli.registration import Options, align
-from fmr_cli.weights import bundled_encoder, bundled_path
+from fmr_cli.weights import bundled_encoder, fast_encoder
 
 Row = dict[str, Any]
 Rows = list[Row]
@@ -83,8 +82,7 @@ def ic(setup: Setup) -> Rows:
 
     torch.set_num_threads(CORES)
     encoder = bundled_encoder()
-    with bundled_path() as path:
-        fast = FastEncoder.load(path)
+    fast = fast_encoder()
     rng = np.random.default_rng(setup.seed)
     source, target, truth = make_pair("copy", setup.clouds[0], rng)
     length = 2 * np.abs(target - target.mean(0)).max()

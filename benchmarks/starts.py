@@ -14,12 +14,14 @@ import argparse
 import itertools
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.common import PEERS, Way
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.io import read_cloud
 from fmr_cli.pair import Pair, Prepared, Start
@@ -57,42 +59,18 @@ def from_folder(folder: Path, count: int, seed: int) -> Iterator[Problem]:
         yield turned(*pairs[i], rng)
 
 
-def fpfh(pair: Pair) -> list[Start]:
-    import open3d as o3d
-
-    reg, v = o3d.pipelines.registration, pair.edge
-
-    def describe(points: np.ndarray) -> tuple:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * v, 30))
-        return cloud, reg.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(5 * v, 100))
-
-    (s, fs), (t, ft) = describe(pair.s.points), describe(pair.t.points)
-    checks = [reg.CorrespondenceCheckerBasedOnEdgeLength(0.9), reg.CorrespondenceCheckerBasedOnDistance(1.5 * v)]
-    found = reg.registration_ransac_based_on_feature_matching(
-        s, t, fs, ft, True, 1.5 * v, reg.TransformationEstimationPointToPoint(False), 3, checks,
-        reg.RANSACConvergenceCriteria(100_000, 0.999),
-    )  # fmt: skip
-    return [Start(np.array(found.transformation), "features", [])]
-
-
-def kiss_matcher(pair: Pair) -> list[Start]:
-    import kiss_matcher as km
-
-    matcher = km.KISSMatcher(km.KISSMatcherConfig(pair.edge))
-    found = matcher.estimate(pair.source.points.astype(np.float32), pair.target.points.astype(np.float32))
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = found.rotation, np.ravel(found.translation)
-    return [Start(T, "features", [])]
+def peer(start: Callable[[float], Way], pair: Pair) -> list[Start]:
+    """Where another tool would start, told the pair's voxel edge."""
+    return [Start(start(pair.edge)(pair.source.points, pair.target.points), "features", [])]
 
 
 def starts() -> dict[str, Callable[[Pair], list[Start]]]:
     made: dict[str, Callable[[Pair], list[Start]]] = {"search": Pair.from_search, "features": Pair.from_features}
-    for name, module, make in (("FPFH + RANSAC", "open3d", fpfh), ("KISS-Matcher", "kiss_matcher", kiss_matcher)):
+    for name, start in PEERS.items():
         try:
-            __import__(module)
-            made[name] = make
-        except ImportError as error:
+            start(1.0)
+            made[name] = partial(peer, start)
+        except (ImportError, OSError) as error:
             print(f"{name}: skipped ({error})")
     return made
 

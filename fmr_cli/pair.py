@@ -176,11 +176,6 @@ class Pair:
         )
 
     @cached_property
-    def feature(self) -> np.ndarray:
-        """F(P) of the target."""
-        return self.encoder(self.P, self.threads)
-
-    @cached_property
     def template(self) -> Template:
         """The global feature of the target, and its Jacobian."""
         return self.encoder.template(self.P, self.threads)
@@ -371,7 +366,7 @@ class Pair:
     def feature_error(self, T: np.ndarray) -> float:
         """Mean |F(T Q) - F(P)| of the global feature at a pose."""
         g = self.normalised(T).astype(np.float32)
-        return float(np.abs(self.encoder(self.Q @ g[:3, :3].T + g[:3, 3], self.threads) - self.feature).mean())
+        return float(np.abs(self.encoder(self.Q @ g[:3, :3].T + g[:3, 3], self.threads) - self.template.feature).mean())
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:

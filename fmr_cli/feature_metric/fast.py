@@ -16,9 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from fmr_cli.feature_metric.motion import exp
-from fmr_cli.feature_metric.weight_file import read_weights
-
-Layers = list[tuple[np.ndarray, np.ndarray]]  # (W (out, in), b (out,)) float32 of each
+from fmr_cli.feature_metric.weight_file import Layers, read_weights
 
 MAX_STEP = 1.0  # rad, and units of the normalised cloud
 # Wide at first: channels that a large rotation moves are no outliers yet (from 4, success at 60 deg is 0.44, not 0.75).

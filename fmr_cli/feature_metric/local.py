@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fmr_cli.feature_metric.weight_file import Layers
+
 PATCH_RADIUS = 8.0  # voxel edges
 NEIGHBOURS = 256  # looked up in a patch: about what a surface holds within the radius
 PATCH_POINTS = 64  # of them, encoded
@@ -22,10 +24,10 @@ CHUNK = 12  # patches encoded at once: their activations stay in the processor's
 
 @dataclass(frozen=True)
 class LocalEncoder:
-    """The trained weights, each layer (out, in) and (out,), float32: of the points' MLP, and of the head."""
+    """The trained weights: of the points' MLP, and of the head."""
 
-    point: list[tuple[np.ndarray, np.ndarray]]
-    head: list[tuple[np.ndarray, np.ndarray]]
+    point: Layers
+    head: Layers
 
     @classmethod
     def load(cls, path: Path) -> LocalEncoder:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fmr_cli.feature_metric.fast import constrained_step
+from fmr_cli.feature_metric.fast import Layers, capped, chain, constrained_step
 from fmr_cli.feature_metric.motion import exp
 
 LAYERS = 3  # of the encoder: 64-64-64
@@ -26,7 +26,6 @@ SCALE_FROM, SCALE_TO = 3.0, 1.0  # the robust scale's factor over the iterations
 MAX_STEP = 0.5
 CHUNK = 16  # balls encoded at once: their activations stay in the processor's cache
 
-Layers = list[tuple[np.ndarray, np.ndarray]]  # of an encoder: weight (out, in) and bias (out,) of each
 # (centres (P, 3)) -> offsets (P, n, 3) in radii, valid (P, n), float32: how the points lie in the balls
 Neighbourhoods = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -83,9 +82,7 @@ def patch_template(layers: Layers, centres: np.ndarray, look: Neighbourhoods, ra
         x = np.maximum(x, 0)
     weight, bias = layers[LAYERS - 1]
     value = (x * weight).sum(-1) + bias
-    slope = weight  # df/du before the last ReLU, which is on wherever the feature is above 0
-    for (inner, _), mask in zip(reversed(layers[: LAYERS - 1]), reversed(on), strict=True):
-        slope = (slope * mask) @ inner
+    slope = chain(layers[:LAYERS], on)  # df/du before the last ReLU, which is on wherever the feature is above 0
     # d[(1 - |u|²) f(u)]/du = (1 - |u|²) df/du - 2 u f
     window = 1 - (u * u).sum(-1, keepdims=True)
     gradient = (window * slope - 2 * u * value[..., None]) / radius
@@ -120,6 +117,5 @@ def refine(
         if iteration < iterations:
             A = np.tensordot(weight, template.JtJ, 1)
             b = weight @ (r[:, None] @ template.J)[:, 0]
-            step = constrained_step(A, b, basis)
-            g = exp(step * min(MAX_STEP / max(float(np.linalg.norm(step)), 1e-30), 1.0)) @ g
+            g = exp(capped(constrained_step(A, b, basis), MAX_STEP)) @ g
     return PatchFit(g, np.where(occupied, error, np.nan), weight)

@@ -23,9 +23,7 @@ APART = math.radians(10.0)  # poses nearer than this are one
 
 
 class Solver(Protocol):
-    """F and the solver on it: ``fast.FastEncoder``, or ``solver.OnDevice`` on a GPU."""
-
-    def __call__(self, points: np.ndarray, /) -> np.ndarray: ...
+    """What solves from given starts: ``fast.FastEncoder``, or ``solver.OnDevice`` on a GPU."""
 
     def template(self, target: np.ndarray, threads: int = 1) -> Template: ...
 

@@ -144,11 +144,6 @@ class OnDevice:
         return torch.from_numpy(np.asarray(x, np.float32)).to(self.device)
 
     @torch.inference_mode()
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """F: (N, 3) -> (K,)."""
-        return self.encoder(self.tensor(points)[None])[0].cpu().numpy()
-
-    @torch.inference_mode()
     def template(self, target: np.ndarray, threads: int = 1) -> fast.Template:
         """F(P) and its exact Jacobian: target (N, 3)."""
         made = make_template(self.encoder, self.tensor(target)[None])

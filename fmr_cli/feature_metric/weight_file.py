@@ -11,17 +11,19 @@ import numpy as np
 
 from fmr_cli.errors import ModelError
 
+Layers = list[tuple[np.ndarray, np.ndarray]]  # (W (out, in), b (out,)) float32 of each
+
 
 @dataclass
 class Weights:
-    """hidden: the hidden layers' widths; layers: (W (out, in), b (out,)) float32 of every layer, the last one K wide.
+    """hidden: the hidden layers' widths; layers: the hidden ones and the last, K wide.
 
     decoder: the decoder's arrays by name, empty where the file holds none.
     """
 
     hidden: tuple[int, ...]
     feature_dim: int
-    layers: list[tuple[np.ndarray, np.ndarray]]
+    layers: Layers
     decoder: dict[str, np.ndarray]
 
 
