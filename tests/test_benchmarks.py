@@ -88,3 +88,9 @@ def test_accuracy_of_a_folder(tmp_path: Path) -> None:
     rows = json.loads((tmp_path / "a.json").read_text())["rows"]
     assert rows[0]["method"] == "fmr"
     assert rows[0]["recall"] == 1.0
+
+
+def test_the_card_of_the_encoder_can_be_measured_again() -> None:
+    said = run("benchmarks.encoders", "models/base.safetensors", "--pairs", "1")
+    for clouds in ("shapes", "others", "rooms"):
+        assert clouds in said

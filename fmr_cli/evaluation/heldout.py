@@ -97,9 +97,19 @@ def errors(estimate: Tensor, truth: Tensor) -> Errors:
     return Errors(*(x.cpu().numpy() for x in (rotation, translation, rmse)))
 
 
-def score(encoder: Encoder, pool: Tensor, settings: tuple[Setting, ...], count: int, points: int) -> dict[str, Errors]:
+def score(
+    encoder: Encoder,
+    pool: Tensor,
+    settings: tuple[Setting, ...],
+    count: int,
+    points: int,
+    *,
+    robust: bool = True,
+    first_seed: int = 0,
+) -> dict[str, Errors]:
     """The errors of an encoder on held-out clouds (S, M, 3) at every setting."""
-    return {
-        setting.name: errors(register(encoder, pairs := draw(pool, setting, count, points, seed)), pairs.truth)
-        for seed, setting in enumerate(settings)
-    }
+    found = {}
+    for seed, setting in enumerate(settings, first_seed):
+        pairs = draw(pool, setting, count, points, seed)
+        found[setting.name] = errors(register(encoder, pairs, robust=robust), pairs.truth)
+    return found
