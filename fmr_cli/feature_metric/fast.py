@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.motion import exp
 from fmr_cli.feature_metric.weight_file import Layers, read_weights
 
 MAX_STEP = 1.0  # rad, and units of the normalised cloud
-# Wide at first: channels that a large rotation moves are no outliers yet (from 4, success at 60 deg is 0.44, not 0.75).
-SCALE_FROM, SCALE_TO = 12.0, 0.7  # the robust scale's factor over the iterations, times the mean |r|
+SCALES = tuple(np.geomspace(6.0, 1.5, 10).tolist())  # of the robust regression, times the median |r - J dtheta|
 STOP_STEP = 1e-7  # the float32 noise floor of a normalised cloud's feature
 RANK_TOLERANCE = 1e-9  # of the largest eigenvalue of JᵀJ
 CHUNK = 256  # points; their activation of CHUNK x K stays in cache
@@ -39,11 +39,19 @@ Run = Callable[[Callable, Iterable], Iterable]
 
 @dataclass
 class Template:
-    """What the solver keeps of the target P. feature: (K,) float32; J: (K, 6) float64; rank: of JᵀJ."""
+    """What the solver keeps of the target P. feature: (K,) float32; J: (K, 6) float64.
+
+    seen: (6, 6) float64, the projector onto the directions that JᵀJ sees; no step leaves them.
+    """
 
     feature: np.ndarray
     J: np.ndarray
-    rank: int
+    seen: np.ndarray
+
+    @property
+    def rank(self) -> int:
+        """Of JᵀJ."""
+        return round(float(np.trace(self.seen)))
 
 
 @dataclass
@@ -180,19 +188,21 @@ class FastEncoder:
         """F(P) and its exact Jacobian, from the critical points: target (N, 3)."""
         feature, index = self.encode(target, threads)
         J = self.jacobian(target, index).astype(np.float64)
-        eigenvalues = np.linalg.eigvalsh(J.T @ J)
-        return Template(feature, J, int((eigenvalues > RANK_TOLERANCE * max(eigenvalues[-1], 1e-30)).sum()))
+        eigenvalues, V = np.linalg.eigh(J.T @ J)
+        V = V[:, eigenvalues > RANK_TOLERANCE * max(eigenvalues[-1], 1e-30)]
+        return Template(feature, J, V @ V.T)
 
-    def jacobian(self, points: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """J of F(exp(-xi) P) at xi = 0: points (N, 3), index (K,) -> (K, 6) float32."""
+    def jacobian(self, points: np.ndarray, index: np.ndarray, g: np.ndarray | None = None) -> np.ndarray:
+        """J of F(exp(-xi) P) at xi = 0, P the points (N, 3) moved by g (4, 4): index (K,) -> (K, 6) float32."""
         critical, back = np.unique(index, return_inverse=True)  # a point that sets many channels passes once
-        x, on = points[critical].astype(np.float32), []
+        p = points[critical] if g is None else transform_points(g, points[critical])
+        x, on = p.astype(np.float32), []
         for W, b in self.layers[:-1]:
             x = x @ W.T + b
             on.append((x > 0)[back])
             x = np.maximum(x, 0)
         row = chain(self.layers, on)
-        return -np.concatenate([np.cross(points[index], row), row], 1)
+        return -np.concatenate([np.cross(p[back].astype(np.float32), row), row], 1)
 
     def solve(
         self,
@@ -214,15 +224,33 @@ class FastEncoder:
             if len(g) == 1 and len(source) >= LARGE:
                 return self.solve_large(template, source, g, iterations, robust, basis, run)
             errors = []
-            for iteration in range(iterations):
-                r = self.peaks(source, g, run)[0] - template.feature
+            for _ in range(iterations):
+                feature, index = self.peaks(source, g, run)
+                r = feature - template.feature
                 errors.append(np.abs(r).mean(-1))
-                step = robust_step(template.J, r, iteration / max(iterations - 1, 1) if robust else None, basis)
+                step = self.step(template, r, source, index, g, robust, basis)
                 g = exp(step) @ g
                 if np.abs(step).max() < STOP_STEP:
                     break
             errors.append(np.abs(self.peaks(source, g, run)[0] - template.feature).mean(-1))
         return Solution(g, np.array(errors), template.rank)
+
+    def step(
+        self,
+        template: Template,
+        r: np.ndarray,
+        source: np.ndarray,
+        index: np.ndarray,
+        g: np.ndarray,
+        robust: bool,
+        basis: np.ndarray | None,
+    ) -> np.ndarray:
+        """dtheta (S, 6) at r (S, K), index (S, K) being the critical points of the source (N, 3) moved by g (S, 4, 4)."""
+        if not robust:
+            return weighted_step(template.J[None], np.ones_like(r), r, basis)
+        J_source = np.array([self.jacobian(source, i, T) for i, T in zip(index, g, strict=True)])
+        J = (template.J + J_source @ template.seen) / 2
+        return weighted_step(J, robust_weight(J, r, basis), r, basis)
 
     def solve_large(
         self,
@@ -247,7 +275,7 @@ class FastEncoder:
         active, near, seen, missed = few(source), False, None, np.inf
         errors, iteration, end, size = [], 0, iterations, np.inf
         while True:
-            feature = self.peaks(active, g, run)[0][0]
+            feature, critical = (x[0] for x in self.peaks(active, g, run))
             finished = iteration >= end or size < STOP_STEP
             far = (
                 np.inf
@@ -258,7 +286,8 @@ class FastEncoder:
             if (close and far > allowed) or (not near and (size < NEAR or iteration >= iterations - LAST)):
                 whole, index = self.contenders(source, g[0], feature - MARGIN * close, run)
                 missed = float(np.mean(whole - feature))
-                active, feature, near, seen = source[index], whole, True, g if close else None
+                active, near, seen = source[index], True, g if close else None
+                feature, critical = (x[0] for x in self.peaks(active, g, run))
             elif finished:
                 missed = 0.0
             r = feature - template.feature
@@ -267,7 +296,7 @@ class FastEncoder:
                 if missed <= MISSED * errors[-1] or end > iterations:
                     return Solution(g, np.array(errors)[:, None], template.rank)
                 end = max(iterations, iteration + MORE)
-            step = robust_step(template.J, r[None], iteration / max(iterations - 1, 1) if robust else None, basis)
+            step = self.step(template, r[None], active, critical[None], g, robust, basis)
             g = exp(step) @ g
             iteration, size = iteration + 1, np.abs(step).max()
 
@@ -283,29 +312,36 @@ def chain(layers: Layers, on: list[np.ndarray]) -> np.ndarray:
     return row
 
 
-def geman_mcclure(r: np.ndarray, factor: float) -> np.ndarray:
-    """(s² / (s² + r²))² with s = factor times the mean |r| of each row: (..., K) -> (..., K)."""
-    s2 = np.maximum((factor * np.abs(r).mean(-1, keepdims=True)) ** 2, 1e-24)
-    return (s2 / (s2 + r * r)) ** 2
+def geman_mcclure(e: np.ndarray, factor: float) -> np.ndarray:
+    """(s² / (s² + e²))² with s = factor times the median |e| of each row: (..., K) -> (..., K)."""
+    middle = (e.shape[-1] - 1) // 2
+    s2 = np.maximum((factor * np.partition(np.abs(e), middle)[..., middle, None]) ** 2, 1e-24)
+    return (s2 / (s2 + e * e)) ** 2
 
 
-def weighted_step(J: np.ndarray, weight: np.ndarray, r: np.ndarray, basis: np.ndarray | None = None) -> np.ndarray:
-    """The capped step dtheta of (JᵀWJ) dtheta = JᵀW r: J (K, 6) float64, weight and r (S, K) -> (S, 6) float64."""
-    products = (J[:, :, None] * J[:, None, :]).reshape(len(J), 36)
-    A = (weight.astype(np.float64) @ products).reshape(-1, 6, 6)
-    b = (weight * r).astype(np.float64) @ J
-    return capped(constrained_step(A, b, basis), MAX_STEP)
+def robust_weight(J: np.ndarray, r: np.ndarray, basis: np.ndarray | None) -> np.ndarray:
+    """The channels' weights in the robust regression of r (S, K) on J (S, K, 6): (S, K).
 
-
-def robust_step(J: np.ndarray, r: np.ndarray, progress: float | None, basis: np.ndarray | None) -> np.ndarray:
-    """The step of r (S, K) -> (S, 6), its weights as they are at ``progress`` from 0 to 1 through the iterations.
-
-    Without progress, all weights are one.
+    Of what a step leaves over, r - J dtheta, not of r: a channel that moves with the cloud is no outlier, however large
+    its r. The scale falls (graduated non-convexity), so that the first step is nearly the least squares one.
     """
-    weight = np.ones_like(r)
-    if progress is not None:
-        weight = geman_mcclure(r, SCALE_FROM + (SCALE_TO - SCALE_FROM) * min(progress, 1.0))
-    return weighted_step(J, weight, r, basis)
+    weight = np.ones(r.shape)
+    for factor in SCALES:
+        dtheta = least_squares(J, weight, r, basis)
+        weight = geman_mcclure(r - (J @ dtheta[..., None])[..., 0], factor)
+    return weight
+
+
+def least_squares(J: np.ndarray, weight: np.ndarray, r: np.ndarray, basis: np.ndarray | None) -> np.ndarray:
+    """dtheta of (JᵀWJ) dtheta = JᵀW r: J (S or 1, K, 6) float64, weight and r (S, K) -> (S, 6) float64."""
+    WJ = weight[..., None] * J
+    A = np.swapaxes(WJ, -1, -2) @ J
+    return constrained_step(A, (r[:, None].astype(np.float64) @ WJ)[:, 0], basis)
+
+
+def weighted_step(J: np.ndarray, weight: np.ndarray, r: np.ndarray, basis: np.ndarray | None) -> np.ndarray:
+    """``least_squares``, no longer than MAX_STEP."""
+    return capped(least_squares(J, weight, r, basis), MAX_STEP)
 
 
 def constrained_step(A: np.ndarray, b: np.ndarray, basis: np.ndarray | None) -> np.ndarray:

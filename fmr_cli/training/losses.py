@@ -14,7 +14,7 @@ from torch import Tensor
 from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder, chain
-from fmr_cli.feature_metric.solver import SCALE_FROM, SCALE_TO, geman_mcclure
+from fmr_cli.feature_metric.solver import robust_weight
 
 DAMPING = 1e-4  # of the mean diagonal of JᵀWJ: keeps an early, badly determined step from blowing up the gradient
 NEAR = 0.05  # point error, in units of the normalised cloud, from which on its logarithm counts
@@ -91,14 +91,16 @@ def pose_loss(
     """
     wanted = se3.transform(truth, source)
     aim = encode(encoder, target)
-    J = jacobian(encoder, aim)
+    J_target = jacobian(encoder, aim)
     g = torch.eye(4, device=source.device).expand(len(source), 4, 4)
     loss = source.new_zeros(())
     for iteration in range(iterations):
-        moved = se3.transform(g, source)
-        r = encode(encoder, moved).feature - aim.feature
-        fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * iteration / max(iterations - 1, 1)
-        weight = geman_mcclure(r, fall) if robust else torch.ones_like(r)
+        code = encode(encoder, se3.transform(g, source))
+        r = code.feature - aim.feature
+        J, weight = J_target, torch.ones_like(r)
+        if robust:
+            J = (J_target + jacobian(encoder, code)) / 2
+            weight = constant_weight(J, r)
         WJ = weight[..., None] * J
         A, b = J.mT @ WJ, WJ.mT @ r[..., None]
         damping = DAMPING * A.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * torch.eye(6, device=A.device)
@@ -108,3 +110,9 @@ def pose_loss(
         distance = (se3.transform(g, source) - wanted).square().sum(-1).mean(-1).clamp_min(1e-12).sqrt()
         loss = loss + (iteration + 1) * torch.log1p(distance / NEAR).mean()
     return 2 * loss / (iterations * (iterations + 1))
+
+
+@torch.no_grad()
+def constant_weight(J: Tensor, r: Tensor) -> Tensor:
+    """``robust_weight`` without a gradient; of what is not finite, any: the loss says so."""
+    return robust_weight(J.double().nan_to_num(), r.nan_to_num()).to(r.dtype)
