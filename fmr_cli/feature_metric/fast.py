@@ -245,7 +245,7 @@ class FastEncoder:
         robust: bool,
         basis: np.ndarray | None,
     ) -> np.ndarray:
-        """dtheta (S, 6) at r (S, K), index (S, K) being the critical points of the source (N, 3) moved by g (S, 4, 4)."""
+        """dtheta (S, 6) at r (S, K); index (S, K): the critical points of the source (N, 3) moved by g (S, 4, 4)."""
         if not robust:
             return weighted_step(template.J[None], np.ones_like(r), r, basis)
         J_source = np.array([self.jacobian(source, i, T) for i, T in zip(index, g, strict=True)])

@@ -6,11 +6,11 @@
 since F(exp(dtheta) g Q) = F(P) holds to first order where F(g Q) = F(exp(-dtheta) P) = F(P) + J dtheta. That is the
 paper's, and what ``robust=False`` does. By default two things differ:
 
-1. J is the mean of the target's and of the same derivative of F(g Q). To second order in dtheta,
-   F(g Q) - F(P) = (J_P + J_gQ) dtheta / 2 (efficient second-order minimisation, Malis 2004), so that larger rotations
-   are found, in fewer iterations. J_gQ costs little: each channel depends on one point.
-2. The step minimises sum_k rho(r_k - J_k dtheta), rho Geman-McClure's. A max-pooled channel is set by one point, so that
-   channels whose point lies outside the overlap are outliers; their weights W switch them off.
+1. J is the mean of the target's and of the same derivative of F(g Q): F(g Q) - F(P) = (J_P + J_gQ) dtheta / 2 to second
+   order (efficient second-order minimisation, Malis 2004), and with half the error where other points come to set a
+   channel on the way. Larger rotations are found, in fewer iterations. J_gQ costs little: each channel has one point.
+2. The step minimises sum_k rho(r_k - J_k dtheta), rho Geman-McClure's. A max-pooled channel is set by one point, so
+   that channels whose point lies outside the overlap are outliers; their weights W switch them off.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ FINITE_STEP = 0.02  # the paper's
 class Template:
     """What the solver keeps of the target P, computed once. feature: (B, K); J: (B, K, 6).
 
-    seen: (B, 6, 6), the projector onto the directions that JᵀJ sees; no step leaves them. J is float64: the products JᵀWJ of float32 would bury the zero eigenvalues of a point or a line in rounding.
+    seen: (B, 6, 6), the projector onto the directions that JᵀJ sees; no step leaves them. J is float64: the products
+    JᵀWJ of float32 would bury the zero eigenvalues of a point or a line in rounding.
     """
 
     feature: Tensor

@@ -28,13 +28,14 @@ from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder, load_weights, save_encoder
 from fmr_cli.io.files import atomic_write
 from fmr_cli.training.data import Augment, Pairs, draw_clouds, draw_pairs, make_pairs, random_motions, random_rotations
-from fmr_cli.training.losses import encode, pose_loss
+from fmr_cli.training.losses import anchor_loss, draw_anchors, encode, pose_loss
 from fmr_cli.training.recipe import Recipe, read_recipe
 
 RAMP = 100  # steps over which the learning rate rises from zero
 LAST_RATE = 0.01  # of the learning rate, where its cosine ends
 MARGIN = 0.97  # of the minutes that were asked for are planned
 os.umask(UMASK := os.umask(0))
+ANCHOR_POINTS = 2048  # of a step
 TIMED = 20  # steps whose time the plan rests on
 
 MODEL, STATE, RECIPE, METRICS, CARD = (
@@ -102,14 +103,15 @@ class Trainer:
             encoder, decoder_weights = start
             encoder = encoder.requires_grad_(True)
         self.encoder = encoder.train().to(self.device)
+        self.anchors = draw_anchors(self.encoder.feature_dim, torch.Generator(self.device).manual_seed(recipe.seed))
         self.decoder = None
-        self.warmup = 0
+        self.warm = recipe.anchor_steps  # the first step in which the paper's losses may change the encoder
         if recipe.chamfer_weight > 0:
             self.decoder = Decoder(encoder.feature_dim, recipe.points).to(self.device)
             try:
                 self.decoder.load_state_dict(decoder_weights)
             except RuntimeError:  # none in the file, or for another number of points: a new one
-                self.warmup = recipe.decoder_warmup if start is not None else 0
+                self.warm += recipe.decoder_warmup if start is not None or recipe.anchor_steps else 0
         self.parameters = [*self.encoder.parameters(), *(self.decoder.parameters() if self.decoder else [])]
         self.optimiser = torch.optim.Adam(self.parameters, recipe.learning_rate)
         self.progress = Progress(steps=recipe.steps)
@@ -123,15 +125,17 @@ class Trainer:
         """The losses of a step, those that it has."""
         recipe = self.recipe
         generator = torch.Generator(self.device).manual_seed(hash((recipe.seed, step, self.rank)) % 2**63)
-        share = step / max(self.progress.steps, 1)
+        if step < recipe.anchor_steps:
+            return {"anchors": anchor_loss(self.encoder, self.anchors, recipe.anchor_width, ANCHOR_POINTS, generator)}
+        share = (step - recipe.anchor_steps) / max(self.progress.steps - recipe.anchor_steps, 1)
         losses = {}
         if self.decoder and share <= recipe.chamfer_until:
             clouds = draw_clouds(self.data.train, recipe.chamfer_batch, generator)
             seen, whole = clouds[:, : recipe.points], clouds[:, -recipe.points :]
-            with torch.set_grad_enabled(step >= self.warmup):
+            with torch.set_grad_enabled(step >= self.warm):
                 code = encode(self.encoder, seen).feature
             losses["chamfer"] = recipe.chamfer_weight * chamfer(self.decoder(code), whole).mean()
-        if recipe.pose_weight > 0 and step >= self.warmup and share >= recipe.pose_after:
+        if recipe.pose_weight > 0 and step >= self.warm and share >= recipe.pose_after:
             plain = float(torch.rand((), generator=generator, device=self.device)) < recipe.plain
             full = replace(recipe.augment, rotation=recipe.plain_rotation, overlap=1.0)
             pairs = self.draw(full if plain else recipe.augment, generator)
@@ -178,12 +182,15 @@ class Trainer:
         return values
 
     def rate(self, step: int) -> float:
-        """The learning rate: a ramp, then half a cosine over the steps that are left."""
-        if step < self.warmup:
+        """The learning rate: a ramp, then half a cosine; for the anchors, then for the steps that are left."""
+        first, last, rate = 0, self.recipe.anchor_steps, self.recipe.anchor_rate
+        if step >= last:
+            first, last, rate = self.warm, self.progress.steps, self.recipe.learning_rate
+        if step < first:
             return 1e-3  # the decoder alone
-        done, steps = step - self.warmup, max(self.progress.steps - self.warmup, 1)
+        done, steps = step - first, max(last - first, 1)
         cosine = LAST_RATE + (1 - LAST_RATE) * (1 + math.cos(math.pi * min(done / steps, 1))) / 2
-        return self.recipe.learning_rate * min(1.0, (done + 1) / RAMP) * cosine
+        return rate * min(1.0, (done + 1) / RAMP) * cosine
 
     def average_gradients(self) -> None:
         if self.world > 1:

@@ -1,7 +1,8 @@
 """The two losses of the paper: Chamfer through the decoder (no label needed), and the point error of the unrolled IC.
 
-Both reach the encoder through the critical points alone. Which points those are is found without a gradient and in
-bfloat16, which is faster; their values are exact, and each such point goes through the network once.
+Before them comes ``anchor_loss``, which needs no clouds. Both of the paper's reach the encoder through the critical
+points alone. Which points those are is found without a gradient and in bfloat16, which is faster; their values are
+exact, and each such point goes through the network once.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder, chain
 from fmr_cli.feature_metric.solver import robust_weight
+from fmr_cli.training.data import random_directions
 
 DAMPING = 1e-4  # of the mean diagonal of JᵀWJ: keeps an early, badly determined step from blowing up the gradient
+ANCHOR_REACH, POINT_REACH = 0.7, 1.2  # radii of the balls that anchors and points are drawn in, normalised clouds
 NEAR = 0.05  # point error, in units of the normalised cloud, from which on its logarithm counts
 
 
@@ -74,6 +77,25 @@ def jacobian(encoder: Encoder, code: Code) -> Tensor:
     gradient = chain(encoder.linear, on)
     p = code.points[code.at]
     return -torch.cat([torch.linalg.cross(p, gradient), gradient], -1)
+
+
+def draw_anchors(count: int, generator: torch.Generator) -> Tensor:
+    """(count, 3) anchors, uniform in a ball that holds nearly every normalised cloud."""
+    radius = ANCHOR_REACH * torch.rand(count, 1, generator=generator, device=generator.device) ** (1 / 3)
+    return radius * random_directions(count, generator)
+
+
+def anchor_loss(encoder: Encoder, anchors: Tensor, width: float, count: int, generator: torch.Generator) -> Tensor:
+    """The mean squared error of f_k(p) = 1 / (1 + |p - a_k|² / width²), a_k the anchors (K, 3), on ``count`` points.
+
+    F_k(P) then says how near P comes to a_k (basis point sets, Prokudin et al. 2019), and depends on what is there
+    alone. Trained by the Chamfer or pose loss from nothing, f_k rises towards some side without end, as a support
+    function does: F sees the cloud's extremes, which are what another scan's border cuts off.
+    """
+    radius = POINT_REACH * torch.rand(count, 1, generator=generator, device=anchors.device).sqrt()
+    points = radius * random_directions(count, generator)
+    wanted = 1 / (1 + torch.cdist(points, anchors).square() / width**2)
+    return (encoder.pointwise(points) - wanted).square().mean()
 
 
 def autoencoder_loss(encoder: Encoder, decoder: Decoder, points: Tensor, whole: Tensor) -> Tensor:

@@ -28,12 +28,15 @@ class Recipe:
     crops: int = 4096  # at most, cut from the scans
     cloud_points: int = 2048  # kept of every shape or crop
     points: int = 512  # of each cloud in a step
+    anchor_steps: int = 0  # first steps, in which each channel learns to fall off around an anchor (losses.anchor_loss)
+    anchor_width: float = 0.3  # of the fall
+    anchor_rate: float = 2e-3  # the learning rate in those steps
     chamfer_weight: float = 1.0
     chamfer_batch: int = 24
     pose_weight: float = 0.0
     pose_batch: int = 12
-    pose_after: float = 0.0  # share of the steps before the pose loss sets in
-    chamfer_until: float = 1.0  # share of the steps after which the Chamfer loss stops
+    pose_after: float = 0.0  # share of the steps after the anchors' before the pose loss sets in
+    chamfer_until: float = 1.0  # share of those steps after which the Chamfer loss stops
     unroll: int = 5  # IC iterations that the pose loss goes through
     plain: float = 0.0  # share of the pose steps without robust weights, on pairs that overlap fully
     plain_rotation: float = 90.0  # degrees at most, in those steps
@@ -56,6 +59,8 @@ class Recipe:
         for name in ("feature_dim", "cloud_points", "points", "chamfer_batch", "pose_batch", "unroll", "steps"):
             if getattr(self, name) < 1:
                 wrong.append(f"{name} = {getattr(self, name)}")
+        if self.anchor_steps and self.anchor_width == 0:
+            wrong.append("anchor_width = 0")
         if wrong:
             raise RecipeError(f"the recipe has {wrong[0]}; give a larger number")
         if self.epoch_steps < 1 or self.held_out_pairs < 1 or not 0 < self.held_out < 1:
@@ -64,7 +69,9 @@ class Recipe:
             raise RecipeError("the recipe needs a plain of 1 at most, a share of the pose steps")
         if not 0 < self.augment.overlap <= 1 or not 0 < self.augment.density <= 1:
             raise RecipeError("the recipe's overlap and density must be above 0 and at most 1")
-        if self.chamfer_weight == 0 and self.pose_weight == 0:
+        if self.anchor_steps > self.steps:
+            raise RecipeError(f"the recipe has {self.anchor_steps} anchor_steps of {self.steps} steps; give more steps")
+        if self.chamfer_weight == 0 and self.pose_weight == 0 and self.anchor_steps < self.steps:
             raise RecipeError("the recipe has no loss; set chamfer_weight or pose_weight above 0")
 
     def changed(self, **changes: Any) -> Recipe:

@@ -160,6 +160,7 @@ def write_card(trainer: Trainer) -> None:
     """What the weights in the folder were made from, how, and how well they register."""
     recipe, progress, augment = trainer.recipe, trainer.progress, trainer.recipe.augment
     losses = [
+        *([f"{recipe.anchor_steps} steps of distances to anchors"] if recipe.anchor_steps else []),
         *(["Chamfer distance through the decoder"] if recipe.chamfer_weight else []),
         *([f"point error through {recipe.unroll} unrolled IC iterations"] if recipe.pose_weight else []),
     ]

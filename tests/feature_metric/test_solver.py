@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmr_cli.evaluation.heldout import Setting, draw, errors, register
 from fmr_cli.feature_metric import se3
-from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.encoder import Encoder, jacobian
 from fmr_cli.feature_metric.motion import Motion, rotation_between
 from fmr_cli.feature_metric.solver import make_template, solve
 from fmr_cli.training.shapes import shapes
@@ -69,6 +70,27 @@ def test_missing_parts_pull_robust_weights_off_less_than_plain_least_squares(enc
     robust, plain = (degrees_off(solve(encoder, template, source, identity(16), 10, r).g, T) for r in (True, False))
     assert (robust < 5).float().mean() >= 0.8
     assert robust.median() < 0.6 * plain.median()
+
+
+def test_the_mean_of_both_jacobians_errs_by_half(encoder: Encoder, bodies: Tensor) -> None:
+    template, xi = make_template(encoder, bodies), se3.log(turns(len(bodies), 16).double())
+    moved = se3.transform(se3.exp(-xi).float(), bodies)
+    feature, index = encoder.encode(moved)
+    r = (feature - template.feature).double()
+    mean = (template.J + jacobian(encoder, moved, index).double()) / 2
+    once, both = (r - (J @ xi[..., None])[..., 0] for J in (template.J, mean))
+    assert both.abs().mean() < 0.6 * once.abs().mean()
+
+
+@pytest.mark.parametrize(("overlap", "share"), [(0.9, 0.85), (0.8, 0.7), (0.7, 0.4)])
+def test_cut_and_resampled_shapes_are_registered_from_40_degrees(
+    encoder: Encoder, overlap: float, share: float
+) -> None:
+    pool = torch.from_numpy(shapes(24, 2048, seed=30_000))
+    pairs = draw(pool, Setting("", (40, 40), 0.8, overlap=overlap), 24, 512, seed=3)
+    robust, plain = (errors(register(encoder, pairs, robust=r), pairs.truth) for r in (True, False))
+    assert robust.success >= share
+    assert robust.median < 0.5 * plain.median
 
 
 def test_what_a_point_or_a_line_does_not_determine_shows_in_the_rank_and_stays(encoder: Encoder) -> None:

@@ -70,6 +70,18 @@ def test_a_new_decoder_is_trained_before_it_may_change_a_trained_encoder(tmp_pat
     assert any(not torch.equal(value, first[name]) for name, value in trainer.decoder.state_dict().items())
 
 
+def test_anchors_come_first_then_a_new_decoder_alone_then_the_rest(tmp_path, tiny, data):
+    trainer = Trainer(tiny.changed(anchor_steps=3, decoder_warmup=2, steps=7), data, tmp_path, None)
+    seen = []
+    for _ in range(7):
+        before = trainer.encoder.layers[0].weight.detach().clone()
+        losses = sorted(trainer.step())
+        seen.append((losses, bool((trainer.encoder.layers[0].weight != before).any())))
+    both = ["chamfer", "pose"]
+    assert [losses for losses, _ in seen] == [["anchors"]] * 3 + [["chamfer"]] * 2 + [both] * 2
+    assert [moved for _, moved in seen] == [True] * 3 + [False] * 2 + [True] * 2
+
+
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_what_there_was(tmp_path, tiny, data):
     trainer = Trainer(tiny, data, tmp_path, None)
     reports = trainer.run()

@@ -9,7 +9,15 @@ from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.encoder import jacobian as exact_jacobian
 from fmr_cli.training.data import Augment, draw_pairs
-from fmr_cli.training.losses import autoencoder_loss, critical_index, encode, jacobian, pose_loss
+from fmr_cli.training.losses import (
+    anchor_loss,
+    autoencoder_loss,
+    critical_index,
+    draw_anchors,
+    encode,
+    jacobian,
+    pose_loss,
+)
 from fmr_cli.training.shapes import shapes
 
 
@@ -69,3 +77,19 @@ def test_the_pose_loss_is_small_at_the_truth_and_its_gradient_reaches_the_encode
     encoder.zero_grad()
     away.backward()
     assert all(bool(torch.isfinite(p.grad).all()) and float(p.grad.abs().sum()) > 0 for p in encoder.parameters())
+
+
+def test_the_anchor_loss_falls_until_each_channel_peaks_at_its_own_anchor():
+    torch.manual_seed(0)
+    encoder, anchors = Encoder(8, (32, 32)), draw_anchors(8, generator())
+    assert float(anchors.norm(dim=1).max()) <= 0.7
+    optimiser, draw, losses = torch.optim.Adam(encoder.parameters(), 1e-2), generator(), []
+    for _ in range(300):
+        loss = anchor_loss(encoder, anchors, 0.3, 512, draw)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0] / 20
+    own = encoder.pointwise(anchors).argmax(0)  # of all anchors, which one each channel is largest at
+    assert (own == torch.arange(8)).float().mean() >= 0.75

@@ -30,6 +30,8 @@ def test_missing_keys_keep_their_defaults(tmp_path):
         ("plain = 1.5", "plain of 1 at most"),
         ("held_out = 1.0", "held_out between 0 and 1"),
         ("chamfer_weight = 0", "no loss"),
+        ("anchor_steps = 5000", "5000 anchor_steps of 3000 steps"),
+        ("anchor_steps = 5\nanchor_width = 0", "anchor_width = 0"),
         ("steps =", "not valid TOML"),
         ("augment = 3", "must be a table"),
     ],
