@@ -33,7 +33,7 @@ def registration_options(
     max_angle: Annotated[float | None, option("No rotation beyond it, in degrees.", min=0.0)] = None,
     max_shift: Annotated[float | None, option("No shift of the source's centre beyond it.", min=0.0)] = None,
     iterations: Annotated[int, option("Iterations of the solver, at most.", min=1)] = 10,
-    robust: Annotated[bool, option("Robust weights, or the paper's plain least squares.")] = True,
+    robust: Annotated[bool, option("Robust steps on both clouds' Jacobians, or the paper's plain ones.")] = True,
     refine: Annotated[bool, option("Finish with a geometric polish.")] = True,
     model: Annotated[Path | None, option("Encoder weights, .safetensors. [default: the bundled ones]")] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the solver runs; auto: the CPU.")] = "auto",

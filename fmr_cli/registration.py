@@ -46,7 +46,7 @@ class Options:
     init: where to start: "auto" (cheap starts first, more while the verdict is not sure), "search" (rotations spread
         over SO(3)), "features" (matched local patches), "centroid", "identity", or a 4x4 T_target_source.
     iterations: of the IC solver from a given start, at most.
-    robust: robust weights, or the paper's plain least squares.
+    robust: robust steps on both clouds' Jacobians, or the paper's plain ones on the target's (``solver``).
     refine: finish with a geometric polish (GICP).
     model: the global encoder's weights (.safetensors), or None for the bundled ones.
     device: "cpu", "cuda" or "auto" (the CPU): where the solver of the global feature runs.

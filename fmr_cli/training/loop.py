@@ -219,24 +219,24 @@ class Trainer:
             row = self.test({})
             yield self.report(row, 0.0, 0.0, started)
         test_seconds = time.monotonic() - started
-        sums: dict[str, float] = {}
+        seen: dict[str, list[float]] = {}  # a loss is missing in the steps before it sets in
         first, epoch_start, counted = time.monotonic(), time.monotonic(), 0
         timed_from = progress.step
         while progress.step < progress.steps:
             values = self.step()
             counted += 1
             for name, value in values.items():
-                sums[name] = sums.get(name, 0.0) + value
+                seen.setdefault(name, []).append(value)
             if not self.planned and progress.step - timed_from == TIMED:
                 self.plan((time.monotonic() - first) / TIMED, test_seconds, time.monotonic() - started)
             late = bool(self.agreed(self.minutes is not None and time.monotonic() - started > 60 * self.minutes))
             if progress.step % recipe.epoch_steps == 0 or progress.step == progress.steps or late:
                 progress.seconds = time.monotonic() - started
                 seconds = time.monotonic() - epoch_start
-                means = {name: value / counted for name, value in sums.items()}
+                means = {name: float(np.mean(value)) for name, value in seen.items()}
                 row = self.test(means)
                 yield self.report(row, sum(means.values()), seconds / counted, started)
-                sums, counted, epoch_start = {}, 0, time.monotonic()
+                seen, counted, epoch_start = {}, 0, time.monotonic()
                 if late:
                     break
             else:
@@ -277,7 +277,9 @@ class Trainer:
             progress.scores[str(progress.epoch)] = {
                 name: [e.success, e.median, float(np.minimum(e.rotation, 30).mean())] for name, e in found.items()
             }
-            if self.quality(progress.epoch) > self.quality(progress.best) or progress.epoch == 0:
+            # While anchors are learnt there is nothing to choose: the paper's losses are yet to come.
+            early = progress.step <= self.recipe.anchor_steps
+            if early or self.quality(progress.epoch) > self.quality(progress.best):
                 progress.best = progress.epoch
                 self.write(MODEL, lambda path: save_encoder(path, self.encoder, self.decoder))
             row = {"epoch": progress.epoch, "step": progress.step, "seconds": round(progress.seconds, 1),

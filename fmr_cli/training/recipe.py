@@ -38,7 +38,7 @@ class Recipe:
     pose_after: float = 0.0  # share of the steps after the anchors' before the pose loss sets in
     chamfer_until: float = 1.0  # share of those steps after which the Chamfer loss stops
     unroll: int = 5  # IC iterations that the pose loss goes through
-    plain: float = 0.0  # share of the pose steps without robust weights, on pairs that overlap fully
+    plain: float = 0.0  # share of the pose steps as in the paper, not robust, on pairs that overlap fully
     plain_rotation: float = 90.0  # degrees at most, in those steps
     decoder_warmup: int = 200  # steps for a new decoder alone, where the encoder is already trained
     learning_rate: float = 3e-4

@@ -183,7 +183,7 @@ def write_card(trainer: Trainer) -> None:
         else "- Kept: the start. Training made the held-out registrations no better.",
         "",
         f"Share of {recipe.held_out_pairs} held-out registrations below 5 deg, and their median error in deg, from the "
-        "identity, 10 iterations, robust weights, 512 points, source and target sampled apart:",
+        "identity, 10 iterations, robust steps, 512 points, source and target sampled apart:",
         "",
         "| setting | start | these weights |",
         "| --- | --- | --- |",
