@@ -286,8 +286,9 @@ class FastEncoder:
             if (close and far > allowed) or (not near and (size < NEAR or iteration >= iterations - LAST)):
                 whole, index = self.contenders(source, g[0], feature - MARGIN * close, run)
                 missed = float(np.mean(whole - feature))
-                active, near, seen = source[index], True, g if close else None
-                feature, critical = (x[0] for x in self.peaks(active, g, run))
+                active, feature, near, seen = source[index], whole, True, g if close else None
+                if robust:  # whose step needs to know the points behind the feature
+                    critical = self.peaks(active, g, run)[1][0]
             elif finished:
                 missed = 0.0
             r = feature - template.feature
