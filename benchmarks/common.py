@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.io import SUFFIXES, read_cloud
-from fmr_cli.registration import Options, align
-from fmr_cli.training import scenes
-from fmr_cli.training.shapes import shapes
+from fmr_cli.registration.options import Options
+from fmr_cli.registration.pipeline import align
+from fmr_cli.synthetic import scenes
+from fmr_cli.synthetic.shapes import shapes
 
 Way = Callable[[np.ndarray, np.ndarray], np.ndarray]  # source (N, 3), target (M, 3) -> T_target_source
 

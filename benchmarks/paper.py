@@ -11,8 +11,8 @@ import itertools
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.geometry import se3
 
 STEP = 0.02  # of the finite differences, the paper's
 

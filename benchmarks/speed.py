@@ -43,12 +43,13 @@ from benchmarks.common import (
 )
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.io import write_cloud
-from fmr_cli.registration import Options, align
-from fmr_cli.weights import bundled_encoder, fast_encoder
+from fmr_cli.registration.models import bundled_encoder, fast_encoder
+from fmr_cli.registration.options import Options
+from fmr_cli.registration.pipeline import align
 
 Row = dict[str, Any]
 Rows = list[Row]
-FMR = [sys.executable, "-c", "from fmr_cli.cli import main; main()"]  # what the command `fmr` runs
+FMR = [sys.executable, "-c", "from fmr_cli.cli.app import main; main()"]  # what the command `fmr` runs
 
 
 @dataclass
@@ -241,9 +242,9 @@ def gpu(setup: Setup) -> Rows:
     """Pairs a second in batches through the solver, and training samples a second: on the CPU and on a GPU."""
     import torch
 
-    from fmr_cli.feature_metric import se3
     from fmr_cli.feature_metric.encoder import Encoder
     from fmr_cli.feature_metric.solver import make_template, solve
+    from fmr_cli.geometry import se3
     from fmr_cli.training.losses import pose_loss
 
     @torch.inference_mode()

@@ -24,9 +24,11 @@ from scipy.spatial.transform import Rotation
 from benchmarks.common import PEERS, Way
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.io import read_cloud
-from fmr_cli.pair import Pair, Prepared, Start
-from fmr_cli.registration import Options, local_pose, make_pair
-from fmr_cli.training.local import scan_pair
+from fmr_cli.registration.options import Options
+from fmr_cli.registration.pair import Pair, Start
+from fmr_cli.registration.pipeline import local_pose, make_pair
+from fmr_cli.registration.prepared import Prepared
+from fmr_cli.synthetic.pairs import scan_pair
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, target, T_target_source
 

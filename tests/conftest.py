@@ -21,7 +21,7 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def room_scans() -> tuple[np.ndarray, np.ndarray]:
     """Two scans (12,000, 3) of one procedural room in its frame, metres, z up; 57 % of their points overlap."""
-    from fmr_cli.training import scenes
+    from fmr_cli.synthetic import scenes
 
     rng = np.random.default_rng(1)
     room = scenes.room(rng)

@@ -14,9 +14,9 @@ import torch
 from benchmarks import paper, speed
 from benchmarks.common import PROTOCOLS, interleaved, make_pair, pose_error, room_clouds
 from fmr_cli.cloud import PointCloud, transform_points
-from fmr_cli.feature_metric.motion import exp
+from fmr_cli.geometry.motion import exp
 from fmr_cli.io import write_cloud
-from fmr_cli.weights import bundled_encoder
+from fmr_cli.registration.models import bundled_encoder
 
 ROOT = Path(__file__).parents[1]
 

@@ -14,12 +14,13 @@ from torch import Tensor
 from fmr_cli.errors import FmrError
 from fmr_cli.evaluation.heldout import Setting, draw, errors
 from fmr_cli.evaluation.methods import Method
-from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.solver import make_template, solve
+from fmr_cli.geometry import se3
+from fmr_cli.geometry.sampling import to_size
+from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.io import read_cloud
-from fmr_cli.preprocess import voxel_downsample
-from fmr_cli.training.scans import find_scans, to_size
+from fmr_cli.io.folders import find_scans
 
 GRID = 100  # voxel edges in a cloud's size: evens out the density
 SHIFT = 0.8  # of the unit box, the paper's; centring takes it out

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.solver import make_template, solve
-from fmr_cli.training.data import Pairs, cut, draw_clouds, make_pairs, random_motions
+from fmr_cli.geometry import se3
+from fmr_cli.synthetic.batches import Pairs, cut, draw_clouds, make_pairs, random_motions
 
 SUCCESS = 5.0  # degrees
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from fmr_cli.evaluation.heldout import register
 from fmr_cli.feature_metric.encoder import Encoder
-from fmr_cli.training.data import Pairs
-from fmr_cli.weights import Device, encoder
+from fmr_cli.registration.models import Device, encoder
+from fmr_cli.synthetic.batches import Pairs
 
 Method = Callable[[Pairs], Tensor]
 

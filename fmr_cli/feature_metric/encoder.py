@@ -14,7 +14,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.feature_metric.weight_file import read_weights
+from fmr_cli.io.weights import read_weights
 
 HIDDEN = (64, 64, 64, 128)
 FEATURE_DIM = 1024

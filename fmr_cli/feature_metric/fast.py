@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.feature_metric.motion import exp
-from fmr_cli.feature_metric.weight_file import Layers, read_weights
+from fmr_cli.feature_metric.layers import Layers
+from fmr_cli.geometry.motion import exp
+from fmr_cli.io.weights import read_weights
 
 MAX_STEP = 1.0  # rad, and units of the normalised cloud
 SCALES = tuple(np.geomspace(6.0, 1.5, 10).tolist())  # of the robust regression, times the median |r - J dtheta|

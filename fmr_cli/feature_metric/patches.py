@@ -17,8 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fmr_cli.feature_metric.fast import Layers, capped, chain, constrained_step
-from fmr_cli.feature_metric.motion import exp
+from fmr_cli.feature_metric.fast import capped, chain, constrained_step
+from fmr_cli.feature_metric.layers import Layers
+from fmr_cli.geometry.motion import exp
 
 LAYERS = 3  # of the encoder: 64-64-64
 MIN_SHARE = 0.35  # of the target's points a ball must hold of the source

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from fmr_cli.feature_metric.fast import Solution, Template
-from fmr_cli.feature_metric.motion import rotation_between
+from fmr_cli.geometry.motion import rotation_between
 
 # 64 rotations leave none further than 60.4 deg from a start (30 on average); the solver's basin, measured, reaches 60.
 STARTS = 64

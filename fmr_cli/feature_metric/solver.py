@@ -22,9 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmr_cli.feature_metric import fast, se3
+from fmr_cli.feature_metric import fast
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
 from fmr_cli.feature_metric.fast import MAX_STEP, RANK_TOLERANCE, SCALES, STOP_STEP
+from fmr_cli.geometry import se3
 
 FINITE_STEP = 0.02  # the paper's
 

@@ -27,7 +27,15 @@ from fmr_cli.evaluation.heldout import HARD, score
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder, load_weights, save_encoder
 from fmr_cli.io.files import atomic_write
-from fmr_cli.training.data import Augment, Pairs, draw_clouds, draw_pairs, make_pairs, random_motions, random_rotations
+from fmr_cli.synthetic.batches import (
+    Augment,
+    Pairs,
+    draw_clouds,
+    draw_pairs,
+    make_pairs,
+    random_motions,
+    random_rotations,
+)
 from fmr_cli.training.losses import anchor_loss, draw_anchors, encode, pose_loss
 from fmr_cli.training.recipe import Recipe, read_recipe
 
@@ -379,7 +387,7 @@ def saved_recipe(out: Path) -> Recipe:
 
 def read_start(name: str) -> tuple[Encoder, dict[str, Tensor]] | None:
     """The weights to start from: "scratch" is None, "base" the bundled ones, else a file. Raises ModelError."""
-    from fmr_cli.weights import bundled_path
+    from fmr_cli.registration.models import bundled_path
 
     if name == "scratch":
         return None

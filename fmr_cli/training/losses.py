@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder, chain
 from fmr_cli.feature_metric.solver import robust_weight
-from fmr_cli.training.data import random_directions
+from fmr_cli.geometry import se3
+from fmr_cli.synthetic.batches import random_directions
 
 DAMPING = 1e-4  # of the mean diagonal of JᵀWJ: keeps an early, badly determined step from blowing up the gradient
 ANCHOR_REACH, POINT_REACH = 0.7, 1.2  # radii of the balls that anchors and points are drawn in, normalised clouds

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fmr_cli.errors import FmrError
-from fmr_cli.training.data import Augment
+from fmr_cli.synthetic.batches import Augment
 
 
 class RecipeError(FmrError):

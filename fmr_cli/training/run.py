@@ -11,7 +11,10 @@ import torch
 
 import fmr_cli
 from fmr_cli.errors import FmrError
-from fmr_cli.training.data import Augment
+from fmr_cli.io.folders import find_scans
+from fmr_cli.registration.models import Device, pick_device
+from fmr_cli.synthetic.batches import Augment
+from fmr_cli.synthetic.shapes import shapes
 from fmr_cli.training.loop import (
     CARD,
     MODEL,
@@ -26,9 +29,7 @@ from fmr_cli.training.loop import (
     success_table,
 )
 from fmr_cli.training.recipe import Recipe, read_recipe
-from fmr_cli.training.scans import find_scans, load_material, load_pairs, scene_crops
-from fmr_cli.training.shapes import shapes
-from fmr_cli.weights import Device, pick_device
+from fmr_cli.training.scans import load_material, load_pairs, scene_crops
 
 LEAST_HELD_OUT = 8  # clouds
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,11 @@ import numpy as np
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.errors import FmrError
-from fmr_cli.io import SUFFIXES, read_cloud, read_transform
-from fmr_cli.preprocess import sample, voxel_downsample
-from fmr_cli.training import scenes
+from fmr_cli.geometry.sampling import sample, to_size
+from fmr_cli.geometry.voxels import voxel_downsample
+from fmr_cli.io import read_cloud, read_transform
+from fmr_cli.synthetic import scenes
 
-TABLES = (".txt", ".csv", ".npy", ".npz")  # also poses, calibrations, time stamps
 CROPS_OF_A_SCAN = 24
 SMALLEST = 256  # points of a crop on its grid
 RADII = (0.25, 1.0)  # of a crop, as shares of the distance that 90 % of the scan's points lie within
@@ -32,24 +32,6 @@ class Material:
     scan: np.ndarray
     files: list[Path]
     skipped: list[str]
-
-
-def find_scans(paths: Iterable[Path]) -> list[Path]:
-    """The readable files among the paths, folders searched recursively, sorted. Raises FmrError where there are none.
-
-    Tables (.txt, .csv, .npy, .npz) in a folder count as scans only if it holds nothing that surely is one.
-    """
-    paths, found = list(paths), []
-    for path in paths:
-        if not path.is_dir():
-            found.append(path)
-            continue
-        inside = sorted(f for f in path.rglob("*") if f.is_file() and f.suffix.lower() in SUFFIXES)
-        sure = [f for f in inside if f.suffix.lower() not in TABLES]
-        found += sure or inside
-    if not found:
-        raise FmrError(f"{', '.join(map(str, paths))}: no scan in there; give files of the kinds {' '.join(SUFFIXES)}")
-    return found
 
 
 def load_material(
@@ -136,14 +118,6 @@ def scene_crops(
         if len(points) >= SMALLEST and (cut := crops_of(points, SCENE_CROPS, cloud_points, rng)):
             found.append(np.stack(cut))
     return found
-
-
-def to_size(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` of the points (N, 3) in random order, repeated where N is smaller; normalised, float32."""
-    points = sample(points, count, rng)
-    points = points[np.concatenate([rng.permutation(len(points)) for _ in range(-(-count // len(points)))])[:count]]
-    points = points - points.mean(0)
-    return (points * (0.5 / np.abs(points).max())).astype(np.float32)
 
 
 def load_pairs(path: Path, cloud_points: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

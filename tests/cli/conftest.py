@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmr_cli.cli import main
+from fmr_cli.cli.app import main
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 

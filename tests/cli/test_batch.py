@@ -149,8 +149,8 @@ def test_an_output_folder_without_a_parent(fmr_here, folder):
 
 
 def test_a_file_of_several_pairs_is_read_once(folder, monkeypatch):
-    from fmr_cli import batch
-    from fmr_cli.registration import Options
+    from fmr_cli.batch import run as batch
+    from fmr_cli.registration.options import Options
 
     read = []
     monkeypatch.setattr(batch, "read_cloud", lambda path, **given: read.append(path.name) or read_cloud(path, **given))
@@ -163,7 +163,7 @@ def test_a_file_of_several_pairs_is_read_once(folder, monkeypatch):
 
 
 def test_the_cache_lets_go_of_what_was_used_longest_ago(tmp_path, monkeypatch):
-    from fmr_cli import batch
+    from fmr_cli.batch import run as batch
 
     monkeypatch.setattr(batch, "CACHED_POINTS", 250)
     for name in "abc":

@@ -28,8 +28,8 @@ def test_help_imports_nothing_heavy():
 
 
 def test_the_options_defaults_are_the_librarys():
-    from fmr_cli.arguments import registration_options
-    from fmr_cli.registration import Options
+    from fmr_cli.cli.options import registration_options
+    from fmr_cli.registration.options import Options
 
     assert Options(**registration_options()) == Options()
 

@@ -18,8 +18,8 @@ from simulation import drive, make_street, scan
 from fmr_cli import PointCloud, read_cloud, write_cloud
 from fmr_cli.cloud import angle_degrees
 from fmr_cli.io import read_poses, write_poses
-from fmr_cli.scans import find_scans
-from fmr_cli.sequence import Sequence
+from fmr_cli.sequence.run import Sequence
+from fmr_cli.sequence.scans import find_scans
 
 FRAMES = 8
 MOVING = 14

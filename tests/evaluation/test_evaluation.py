@@ -9,9 +9,9 @@ import torch
 from fmr_cli.evaluation.experiments import EXPERIMENTS, Clouds, feature_maps, run
 from fmr_cli.evaluation.heldout import Setting, draw, errors
 from fmr_cli.evaluation.methods import baselines, gicp, lm_icp, one_by_one, ours
-from fmr_cli.feature_metric import se3
-from fmr_cli.training.shapes import others
-from fmr_cli.weights import bundled_encoder
+from fmr_cli.geometry import se3
+from fmr_cli.registration.models import bundled_encoder
+from fmr_cli.synthetic.shapes import others
 
 
 @pytest.fixture(scope="module")

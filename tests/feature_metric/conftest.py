@@ -11,8 +11,8 @@ from torch import Tensor
 
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.fast import FastEncoder
-from fmr_cli.training.shapes import shapes
-from fmr_cli.weights import bundled_encoder, bundled_path
+from fmr_cli.registration.models import bundled_encoder, bundled_path
+from fmr_cli.synthetic.shapes import shapes
 
 
 @pytest.fixture(scope="session")

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from fmr_cli.errors import ModelError
-from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.decoder import Decoder
 from fmr_cli.feature_metric.encoder import Encoder, jacobian, load_encoder, load_weights, save_encoder
 from fmr_cli.feature_metric.solver import FINITE_STEP, finite_jacobian
+from fmr_cli.geometry import se3
 
 
 def test_the_paper_s_widths_and_nothing_but_linear_layers() -> None:

@@ -12,8 +12,8 @@ import torch
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
 from fmr_cli.feature_metric.fast import LARGE, FastEncoder
-from fmr_cli.feature_metric.motion import Motion, exp
 from fmr_cli.feature_metric.solver import OnDevice
+from fmr_cli.geometry.motion import Motion, exp
 
 START = np.eye(4)[None]
 

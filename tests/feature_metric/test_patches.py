@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.feature_metric.motion import Motion, exp, rotation_between
-from fmr_cli.feature_metric.patches import Layers, Neighbourhoods, patch_features, patch_template, refine
-from fmr_cli.training.shapes import shapes
-from fmr_cli.weights import solver
+from fmr_cli.feature_metric.layers import Layers
+from fmr_cli.feature_metric.patches import Neighbourhoods, patch_features, patch_template, refine
+from fmr_cli.geometry.motion import Motion, exp, rotation_between
+from fmr_cli.registration.models import solver
+from fmr_cli.synthetic.shapes import shapes
 
 RADIUS = 0.25
 

@@ -10,9 +10,9 @@ import pytest
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.fast import FastEncoder
-from fmr_cli.feature_metric.motion import Motion, rotation_between, rotations
 from fmr_cli.feature_metric.search import APART, KEPT, STARTS, Found, search
 from fmr_cli.feature_metric.solver import OnDevice
+from fmr_cli.geometry.motion import Motion, rotation_between, rotations
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, target, T_target_source
 

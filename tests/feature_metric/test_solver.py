@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from fmr_cli.evaluation.heldout import Setting, draw, errors, register
-from fmr_cli.feature_metric import se3
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
-from fmr_cli.feature_metric.motion import Motion, rotation_between
 from fmr_cli.feature_metric.solver import make_template, solve
-from fmr_cli.training.shapes import shapes
+from fmr_cli.geometry import se3
+from fmr_cli.geometry.motion import Motion, rotation_between
+from fmr_cli.synthetic.shapes import shapes
 
 
 def turns(count: int, degrees: float, shift: float = 0.0, seed: int = 0) -> Tensor:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fmr_cli.synthetic.shapes import shapes
 from fmr_cli.training.loop import Data
 from fmr_cli.training.recipe import Recipe
-from fmr_cli.training.shapes import shapes
 
 
 @pytest.fixture(scope="session")

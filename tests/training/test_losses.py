@@ -8,7 +8,8 @@ import torch
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.encoder import jacobian as exact_jacobian
-from fmr_cli.training.data import Augment, draw_pairs
+from fmr_cli.synthetic.batches import Augment, draw_pairs
+from fmr_cli.synthetic.shapes import shapes
 from fmr_cli.training.losses import (
     anchor_loss,
     autoencoder_loss,
@@ -18,7 +19,6 @@ from fmr_cli.training.losses import (
     jacobian,
     pose_loss,
 )
-from fmr_cli.training.shapes import shapes
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,9 @@ import pytest
 
 from fmr_cli import PointCloud, write_cloud
 from fmr_cli.errors import FmrError
-from fmr_cli.training.scans import SCENE_CROPS, find_scans, load_material, load_pairs, scene_crops
-from fmr_cli.training.shapes import others
+from fmr_cli.io.folders import find_scans
+from fmr_cli.synthetic.shapes import others
+from fmr_cli.training.scans import SCENE_CROPS, load_material, load_pairs, scene_crops
 
 
 @pytest.fixture

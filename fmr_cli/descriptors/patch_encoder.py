@@ -1,0 +1,105 @@
+"""Local patch features, invariant to rotation: where a global feature cannot know what the other scan does not have.
+
+A patch is the neighbourhood of a keypoint, turned into its own frame (a local reference frame after TOLDI, Yang et al.
+2017) and encoded by a small PointNet of the encoder's kind: a shared MLP, a max over points, two layers. All lengths
+are in voxel edges, so that nothing depends on a unit. Trained by ``fmr_cli.training.local``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fmr_cli.feature_metric.layers import Layers
+
+PATCH_RADIUS = 8.0  # voxel edges
+NEIGHBOURS = 256  # looked up in a patch: about what a surface holds within the radius
+PATCH_POINTS = 64  # of them, encoded
+CHANNELS = 10
+FLAT = 0.01  # patch radii: below it, heights say nothing
+CHUNK = 12  # patches encoded at once: their activations stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class LocalEncoder:
+    """The trained weights: of the points' MLP, and of the head."""
+
+    point: Layers
+    head: Layers
+
+    @classmethod
+    def load(cls, path: Path) -> LocalEncoder:
+        from safetensors.numpy import load_file
+
+        w = load_file(path)
+        layers = [
+            [(w[f"{part}.{i}.weight"], w[f"{part}.{i}.bias"]) for i in range(len(w)) if f"{part}.{i}.weight" in w]
+            for part in ("point", "head")
+        ]
+        return cls(*layers)
+
+    def __call__(self, patches: np.ndarray) -> np.ndarray:
+        """(K, PATCH_POINTS, CHANNELS) -> (K, 32) unit descriptors."""
+        pooled = [self.pooled(patches[i : i + CHUNK]) for i in range(0, len(patches), CHUNK)]
+        x = np.concatenate(pooled)
+        for weight, bias in self.head[:-1]:
+            x = np.maximum(x @ weight.T + bias, 0)
+        weight, bias = self.head[-1]
+        x = x @ weight.T + bias
+        return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+
+    def pooled(self, patches: np.ndarray) -> np.ndarray:
+        """The maximum over the points of the MLP; the last bias and ReLU come after it, which is the same."""
+        x = patches.reshape(-1, patches.shape[-1])
+        for weight, bias in self.point[:-1]:
+            x = x @ weight.T
+            x += bias
+            np.maximum(x, 0, out=x)
+        weight, bias = self.point[-1]
+        x = (x @ weight.T).reshape(*patches.shape[:2], -1).max(1)
+        return np.maximum(x + bias, 0)
+
+
+def reference_frames(offsets: np.ndarray, valid: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """A frame per patch: offsets (K, n, 3) from the keypoint in patch radii, valid (K, n), normal (K, 3) -> (K, 3, 3).
+
+    Rows are the axes. z is the normal, its sign taken so that the patch lies on its negative side; x is the sum of the
+    offsets' tangential parts, near and high points weighted most; both survive a changed sampling. Of a flat patch, x
+    points to where most of it lies, so that an outline has features too.
+    """
+    height = (offsets @ normal[..., None])[..., 0] * valid
+    sign = np.where(height.sum(1) > 0, -1, 1).astype(offsets.dtype)
+    z = sign[:, None] * normal
+    near = np.square(np.maximum(1 - np.sqrt((offsets * offsets).sum(-1)), 0)) * valid
+    weight = near * (height * height + FLAT**2)
+    # The weighted sum of offsets - height z, less what rounding leaves along z.
+    x = (weight[:, None] @ offsets)[:, 0] - (sign * (weight * height).sum(1))[:, None] * z
+    x -= (x * z).sum(1, keepdims=True) * z
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+    return np.stack([x, np.cross(z, x), z], 1)
+
+
+def describe_patches(
+    offsets: np.ndarray, valid: np.ndarray, normal: np.ndarray, neighbours: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """The encoder's input (K, PATCH_POINTS, CHANNELS), float32.
+
+    offsets: (K, n, 3) in patch radii, nearest first; valid: (K, n); normal: (K, 3) at the keypoints; neighbours: (K, n)
+    rows of normals (M, 3). Channels: the position in the patch's frame, the products of the normal's components there
+    (which have no sign to guess), and the distance. The points taken are evenly spaced in the order of distance, so
+    even over the patch.
+    """
+    frame = np.swapaxes(reference_frames(offsets, valid, normal), 1, 2)
+    count = np.maximum(valid.sum(1, keepdims=True), 1)
+    chosen = ((np.arange(PATCH_POINTS, dtype=np.float32) + 0.5) / PATCH_POINTS * count).astype(int)  # [K x POINTS]
+    out = np.empty((*chosen.shape, CHANNELS), np.float32)
+    p = np.take_along_axis(offsets, chosen[..., None], 1) @ frame
+    n = normals[np.take_along_axis(neighbours, chosen, 1)] @ frame
+    out[..., :3], out[..., 3:6] = p, n * n
+    np.multiply(n[..., 0], n[..., 1], out=out[..., 6])
+    np.multiply(n[..., 0], n[..., 2], out=out[..., 7])
+    np.multiply(n[..., 1], n[..., 2], out=out[..., 8])
+    out[..., 9] = np.sqrt((p * p).sum(-1))
+    return out

@@ -1,0 +1,124 @@
+"""Which motions are allowed: all rigid ones, or those that keep the vertical, the heading or the plane.
+
+Each is a subgroup: a solver whose every step lies in ``basis`` never leaves it, and nothing is projected afterwards.
+All arrays are float64; what is float32 comes from elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fmr_cli.geometry.dof import Dof
+
+TURNS = 24  # starts about one axis: 15 deg apart
+SMALL = 1e-4  # of a squared angle: below it the series are exact to float64 rounding
+
+
+@dataclass(frozen=True)
+class Motion:
+    """dof: "rigid"; "yaw": rotation about ``up``, any translation; "translation"; "planar": yaw, no shift along up.
+
+    up: unit vector. lift: what "planar" keeps of the translation along up, in the frames in use.
+    """
+
+    dof: Dof = "rigid"
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    lift: float = 0.0
+
+    def basis(self) -> np.ndarray:
+        """Orthonormal twists (6, d), rotation first."""
+        turns = {"rigid": np.eye(3), "translation": np.zeros((3, 0))}.get(self.dof, np.array(self.up)[:, None])
+        shifts = np.eye(3)
+        if self.dof == "planar":
+            shifts = np.linalg.qr(np.column_stack([self.up, shifts]))[0][:, 1:3]
+        basis = np.zeros((6, turns.shape[1] + shifts.shape[1]))
+        basis[:3, : turns.shape[1]], basis[3:, turns.shape[1] :] = turns, shifts
+        return basis
+
+    def starts(self, count: int) -> np.ndarray:
+        """Rotations (n, 4, 4) spread evenly over those allowed."""
+        if self.dof == "rigid":
+            return rotations(count)
+        turns = np.arange(TURNS if self.dof != "translation" else 1) * (2 * math.pi / TURNS)
+        return exp(np.hstack([turns[:, None] * self.up, np.zeros((len(turns), 3))]))
+
+    def exact(self, T: np.ndarray) -> np.ndarray:
+        """The allowed motion next to T (4, 4): what float32 arithmetic has rounded, put right."""
+        T = T.copy()
+        T[:3, :3] = self.rotation(T[:3, :3])
+        if self.dof == "planar":
+            T[:3, 3] += (self.lift - T[:3, 3] @ self.up) * np.array(self.up)
+        return T
+
+    def rotation(self, H: np.ndarray) -> np.ndarray:
+        """The allowed rotations R that maximise tr(Rᵀ H): (..., 3, 3) -> (..., 3, 3).
+
+        Kabsch where the rotation is free; in closed form about ``up`` otherwise.
+        """
+        if self.dof == "translation":
+            return np.broadcast_to(np.eye(3), H.shape)
+        if self.dof == "rigid":
+            U, _, Vt = np.linalg.svd(H)
+            U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+            return U @ Vt
+        up = np.array(self.up)
+        skew = [H[..., 2, 1] - H[..., 1, 2], H[..., 0, 2] - H[..., 2, 0], H[..., 1, 0] - H[..., 0, 1]]
+        cosine = np.trace(H, axis1=-2, axis2=-1) - (H @ up) @ up
+        angle = np.arctan2(np.stack(skew, -1) @ up, cosine)
+        twist = angle[..., None] * up
+        return exp(np.concatenate([twist, np.zeros_like(twist)], -1))[..., :3, :3]
+
+    def fit(self, source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """The weighted least squares motions: source, target (B or 1, n, 3), weight (B, n) -> (B, 4, 4)."""
+        weight = (weight / np.maximum(weight.sum(-1, keepdims=True), 1e-12))[:, None]  # [B x 1 x n]
+        a, b = weight @ source, weight @ target  # [B x 1 x 3]
+        products = (target[..., :, None] * source[..., None, :]).reshape(*source.shape[:2], 9)
+        T = np.tile(np.eye(4), (len(weight), 1, 1))
+        T[:, :3, :3] = self.rotation((weight @ products).reshape(-1, 3, 3) - np.swapaxes(b, 1, 2) * a)
+        shift = (b - a @ np.swapaxes(T[:, :3, :3], 1, 2))[:, 0]
+        if self.dof == "planar":
+            shift = shift + (self.lift - shift @ self.up)[:, None] * self.up
+        T[:, :3, 3] = shift
+        return T
+
+
+def exp(xi: np.ndarray) -> np.ndarray:
+    """Twists (..., 6), rotation first, to (..., 4, 4): R = I + A w^ + B w^², t = (I + B w^ + C w^²) v."""
+    omega, v = xi[..., :3], xi[..., 3:]
+    t = (omega * omega).sum(-1)[..., None, None]
+    small = t < SMALL
+    safe = np.where(small, 1.0, t)
+    a = np.sqrt(safe)
+    A = np.where(small, 1 - t / 6 + t**2 / 120, np.sin(a) / a)
+    B = np.where(small, 0.5 - t / 24 + t**2 / 720, 2 * (np.sin(a / 2) / a) ** 2)
+    C = np.where(small, 1 / 6 - t / 120 + t**2 / 5040, (a - np.sin(a)) / (safe * a))
+    W = np.zeros((*xi.shape[:-1], 3, 3))
+    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -omega[..., 2], omega[..., 1], -omega[..., 0]
+    W -= np.swapaxes(W, -1, -2)
+    W2 = W @ W
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = np.eye(3) + A * W + B * W2
+    T[..., :3, 3] = ((np.eye(3) + B * W + C * W2) @ v[..., None])[..., 0]
+    T[..., 3, 3] = 1
+    return T
+
+
+def rotations(count: int) -> np.ndarray:
+    """(count, 4, 4) rotations spread evenly over SO(3): the super-Fibonacci spiral (Alexa, CVPR 2022)."""
+    phi, psi = math.sqrt(2), 1.533751168755204288118041
+    s = np.arange(count) + 0.5
+    t, d = s / count, 2 * math.pi * s
+    r, R = np.sqrt(t), np.sqrt(1 - t)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    q = [r * np.cos(d / phi), R * np.sin(d / psi), R * np.cos(d / psi), r * np.sin(d / phi)]
+    T[:, :3, :3] = Rotation.from_quat(np.stack(q, -1)).as_matrix()
+    return T
+
+
+def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The angle in radians between rotations (..., 3, 3), batch dimensions broadcast."""
+    return np.arccos(np.clip(((a * b).sum((-1, -2)) - 1) / 2, -1, 1))

@@ -1,0 +1,89 @@
+"""From a cloud to what the method sees: voxel grid, local origin, working scale, normals, and the exact inverse.
+
+Everything follows from the data's own extent and spacing: multiplying all coordinates by a constant multiplies every
+length here by it and changes nothing else.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fmr_cli.geometry.normals import neighbours, normals_and_variation
+from fmr_cli.geometry.voxels import cell_numbers, voxel_downsample
+
+BORDER = 1e-3  # surface variation that a lean of 1 counts as
+SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
+
+
+class Surface:
+    """A cloud on a voxel grid, with what its neighbourhoods say. points: (M, 3) own unit; edge: of the voxels."""
+
+    def __init__(self, points: np.ndarray, edge: float) -> None:
+        self.edge = edge
+        self.points = voxel_downsample(points, edge)
+        self.tree = cKDTree(self.points)
+
+    @cached_property
+    def _near(self) -> tuple[np.ndarray, np.ndarray]:
+        return neighbours(self.points, self.tree)
+
+    @cached_property
+    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        return normals_and_variation(self.points, *self._near)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(M, 3) unit normals of undetermined sign."""
+        return self._shape[0]
+
+    @cached_property
+    def unevenness(self) -> tuple[np.ndarray, np.ndarray]:
+        """How far the nearest 3 lie off each point's tangent plane, own unit, and 1 - |cosine| of their normals: (M,).
+
+        What curvature and noise make of two samples of one surface.
+        """
+        p, n, off, cosine = self.points, self.normals, [], []
+        for there in self._near[1].T[1:4]:
+            off.append(np.abs(np.einsum("ni,ni->n", p[there] - p, n)))
+            cosine.append(np.abs(np.einsum("ni,ni->n", n[there], n)))
+        return np.mean(off, axis=0), 1 - np.mean(cosine, axis=0)
+
+    def keypoints(self, count: int) -> np.ndarray:
+        """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.
+
+        Where neighbours are far, as in a LiDAR's outskirts, variation is chance: such points come last. What is flat
+        has its keypoints on its outline.
+        """
+        _, variation, reach, lean = self._shape
+        order = np.argsort(-np.where(reach < SPARSE * self.edge, variation + BORDER * lean, 0.0), kind="stable")
+        first = np.unique(cell_numbers(self.points[order], 2 * self.edge), return_index=True)[1]
+        return order[np.sort(first)[:count]]
+
+    def patches(self, index: np.ndarray, radius: float, neighbours: int) -> dict[str, np.ndarray]:
+        """The neighbourhoods of points ``index`` (K,): what ``feature_metric.local.describe_patches`` takes, float32.
+
+        radius: in voxel edges. Offsets are in radii, nearest first; what a row lacks of ``neighbours`` is not valid.
+        """
+        offsets, valid, found = self.around(self.points[index], radius * self.edge, neighbours)
+        normals = self.normals.astype(np.float32)
+        return {
+            "offsets": offsets, "valid": valid, "normal": normals[index], "neighbours": found, "normals": normals,
+        }  # fmt: skip
+
+    def around(self, centres: np.ndarray, radius: float, neighbours: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The at most ``neighbours`` nearest points within ``radius`` of centres (K, 3), own unit, nearest first.
+
+        Their offsets from the centre in radii (K, n, 3) and which of them are there (K, n), float32; their rows (K, n),
+        0 where they are not.
+        """
+        found = self.tree.query(centres, min(neighbours, len(self.points)), distance_upper_bound=radius)[1]
+        valid = (found < len(self.points)).astype(np.float32)
+        found[found == len(self.points)] = 0
+        middle = self.points.mean(0)  # about it, float32 is exact enough
+        offsets = ((self.points - middle) / radius).astype(np.float32)[found]
+        offsets -= ((centres - middle) / radius).astype(np.float32)[:, None]
+        offsets *= valid[..., None]
+        return offsets, valid, found

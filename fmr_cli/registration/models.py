@@ -1,0 +1,82 @@
+"""Which weights a command works with, and on which device: the bundled ones or the user's.
+
+Registration on the CPU works in numpy: to import torch takes longer than to register a pair.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from functools import lru_cache
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from fmr_cli.descriptors.patch_encoder import LocalEncoder
+from fmr_cli.errors import ModelError
+from fmr_cli.feature_metric.fast import FastEncoder
+from fmr_cli.feature_metric.search import Solver
+
+if TYPE_CHECKING:
+    import torch
+
+    from fmr_cli.feature_metric.encoder import Encoder
+
+Device = Literal["auto", "cpu", "cuda"]
+
+
+def pick_device(device: Device = "auto") -> torch.device:
+    """The device by name; auto is the GPU where there is one. Raises ModelError for cuda without one."""
+    import torch
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ModelError(
+            "--device cuda: this machine has no usable GPU (torch.cuda.is_available() is false); use auto or cpu"
+        )
+    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+@lru_cache(maxsize=4)
+def encoder(model: Path | None = None, device: Device = "auto") -> Encoder:
+    """The encoder of a .safetensors file, or the bundled one, as torch has it, loaded once. Raises ModelError."""
+    from fmr_cli.feature_metric.encoder import load_encoder
+
+    place = pick_device(device)
+    if model is not None:
+        return load_encoder(model).to(place)
+    with bundled_path() as path:
+        return load_encoder(path).to(place)
+
+
+@lru_cache(maxsize=4)
+def fast_encoder(model: Path | None = None) -> FastEncoder:
+    """The encoder of a .safetensors file, or the bundled one, without torch, loaded once. Raises ModelError."""
+    if model is not None:
+        return FastEncoder.load(model)
+    with bundled_path() as path:
+        return FastEncoder.load(path)
+
+
+def solver(model: Path | None = None, device: Device = "auto") -> Solver:
+    """The IC solver with an encoder's weights: by torch for cuda, else by numpy. Raises ModelError."""
+    if device != "cuda":
+        return fast_encoder(model)
+    from fmr_cli.feature_metric.solver import OnDevice
+
+    return OnDevice(encoder(model, device))
+
+
+def bundled_path() -> AbstractContextManager[Path]:
+    """The bundled encoder's file, for as long as the context is open."""
+    return as_file(files("fmr_cli.models") / "base.safetensors")
+
+
+def bundled_encoder() -> Encoder:
+    """The bundled encoder, as torch has it, on the CPU."""
+    return encoder(None, "cpu")
+
+
+@lru_cache(maxsize=1)
+def bundled_local_encoder() -> LocalEncoder:
+    """The bundled encoder of local patches."""
+    with as_file(files("fmr_cli.models") / "local.safetensors") as path:
+        return LocalEncoder.load(path)

@@ -1,0 +1,87 @@
+"""A cloud made ready for registration, once for all pairs it takes part in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fmr_cli.cloud import PointCloud
+from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
+from fmr_cli.errors import RegistrationError
+from fmr_cli.geometry.gicp import GicpCloud
+from fmr_cli.geometry.sampling import distinct, sample, thinned, working_scale
+from fmr_cli.geometry.surface import Surface
+from fmr_cli.geometry.voxels import voxel_downsample
+
+MIN_POINTS = 10
+AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more in every voxel
+SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxels
+LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
+
+
+class Prepared:
+    """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once.
+
+    points: (N, 3) float64 about ``centre`` (their mean), at most AT_MOST, finite and distinct. edge: the voxel edge
+    that suits this cloud; spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one
+    place.
+    """
+
+    def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        points = thinned(cloud.points, AT_MOST, rng)
+        points = points[np.isfinite(points).all(1)]
+        self.centre = points.mean(0) if len(points) else np.zeros(3)
+        points = distinct(points - self.centre)
+        if len(points) == 1 and len(cloud) > 1:
+            raise RegistrationError(f"{cloud.name}: all {len(cloud)} points are in one place; give a scan of a surface")
+        if len(points) < MIN_POINTS:
+            raise RegistrationError(
+                f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
+            )
+        self.name, self.read, self.seed = cloud.name, len(cloud), seed
+        self.points = points
+        self.edge, self.spacing = working_scale(self.points, rng)
+        self._surfaces: dict[float, Surface] = {}
+        self._described: dict[tuple[float, int], tuple[np.ndarray, np.ndarray]] = {}
+        self._fine: dict[tuple[int, float], np.ndarray] = {}
+        self._gicp: dict[tuple[int, float, bool], GicpCloud] = {}
+
+    def scaled(self, factor: float) -> Prepared:
+        """The same cloud with every length multiplied by ``factor``."""
+        return Prepared(PointCloud((self.points + self.centre) * factor), self.seed)
+
+    def surface(self, edge: float) -> Surface:
+        """The cloud on a voxel grid of ``edge``, about ``centre``."""
+        if edge not in self._surfaces:
+            self._surfaces[edge] = Surface(self.points, edge)
+        return self._surfaces[edge]
+
+    def described(self, edge: float, count: int, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
+        """At most ``count`` keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
+        if (edge, count) not in self._described:
+            surface = self.surface(edge)
+            index = surface.keypoints(count)
+            patches = describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS))
+            self._described[edge, count] = surface.points[index], encoder(patches)
+        return self._described[edge, count]
+
+    def fine(self, count: int, edge: float) -> np.ndarray:
+        """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
+        if (count, edge) not in self._fine:
+            points = self.points if len(self.points) <= 4 * count else voxel_downsample(self.points, edge / 2)
+            self._fine[count, edge] = sample(points, count, np.random.default_rng(self.seed))
+        return self._fine[count, edge]
+
+    def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> GicpCloud:
+        """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""
+        if (count, edge, own) not in self._gicp:
+            rng = np.random.default_rng(self.seed)
+            points = sample(self.points, count, rng) if own else self.fine(count, edge)
+            self._gicp[count, edge, own] = GicpCloud(points, edge, threads)
+        return self._gicp[count, edge, own]
+
+
+def pair_edge(source: Prepared, target: Prepared) -> float:
+    """The voxel edge for both: the finer one's, but not below either's spacing, nor too fine for the larger one."""
+    fine, coarse = sorted((source.edge, target.edge))
+    return max(fine, coarse / LARGEST_RATIO, SPACINGS * source.spacing, SPACINGS * target.spacing)

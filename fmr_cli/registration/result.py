@@ -1,0 +1,92 @@
+"""What a registration gives: the transform and everything said about it."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import scipy
+
+import fmr_cli
+from fmr_cli.registration.options import Options
+
+
+@dataclass
+class Registration:
+    """A transform and everything said about it.
+
+    T_target_source: (4, 4) float64, x_target = s R x_source + t, in the clouds' own unit; s is 1 unless asked for.
+    status: "aligned", or "uncertain" where the evidence at the pose speaks against it.
+    confidence: the probability, from 0 to 1, that the pose is right; poses that fit as well share it.
+    overlap: share of the smaller cloud's points that have a counterpart in the other one.
+    inlier_rmse: root mean square distance of those counterparts, own unit.
+    feature_error_before, feature_error_after: mean |F(g Q) - F(P)| of the global feature as the files are, and at T.
+    feature_errors: the same before each iteration of the IC solver that led to T, and after its last; empty where T
+        came from local features.
+    start: which start the pose came from ("identity", "centroid", "search", "features", "given").
+    angle: rotation angle of T, degrees. shift: how far T moves the source's centre, own unit.
+    information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's
+        mean; rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.
+    undetermined: the directions that the scans hardly determine, in words.
+    alternatives: other poses that would be called aligned if alone, as of a symmetric shape, best first:
+        T_target_source, confidence, feature_error.
+    evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
+    """
+
+    T_target_source: np.ndarray
+    status: Literal["aligned", "uncertain"]
+    confidence: float
+    overlap: float
+    inlier_rmse: float
+    feature_error_before: float
+    feature_error_after: float
+    feature_errors: list[float]
+    start: str
+    angle: float
+    shift: float
+    scale: float
+    information: np.ndarray
+    covariance: np.ndarray
+    origin: np.ndarray
+    undetermined: list[str]
+    alternatives: list[dict[str, Any]]
+    evidence: dict[str, float]
+    voxel_size: float
+    points: dict[str, int]
+    seconds: dict[str, float]
+    options: Options
+    warnings: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain JSON types, with the versions it was made by."""
+        said = {name: plain(value) for name, value in vars(self).items() if name != "options"}
+        options = plain(asdict(self.options))
+        said |= {"iterations": max(len(self.feature_errors) - 1, 0), "options": options, "versions": versions()}
+        return said
+
+
+def plain(value: Any) -> Any:
+    """The value in JSON's types; what is not finite becomes None, since JSON has no word for it."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def versions() -> dict[str, str]:
+    """What could change a result: this tool, the libraries that compute, Python and the processor's architecture."""
+    return {
+        "fmr": fmr_cli.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+    }

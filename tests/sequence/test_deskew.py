@@ -1,0 +1,40 @@
+"""Deskewing: what a moving scanner saw, as seen from where it was in the middle of the scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from fmr_cli import PointCloud
+from fmr_cli.errors import CloudFileError
+from fmr_cli.sequence.deskew import deskew, scan_times
+
+
+def test_a_turning_scanner_is_undone_to_half_a_millimetre():
+    twist = np.zeros((4, 4))
+    twist[:3, :3] = np.cross([0.01, -0.02, 0.07], np.eye(3)).T
+    twist[:3, 3] = [0.8, 0.05, -0.02]
+    rng = np.random.default_rng(0)
+    still, times = rng.uniform(-30, 30, (200, 3)), np.linspace(0, 1, 200)
+    seen = [(np.linalg.inv(expm((t - 0.5) * twist)) @ [*x, 1])[:3] for t, x in zip(times, still, strict=True)]
+    assert np.abs(deskew(np.array(seen), times, expm(twist)) - still).max() < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("gps_time", [300000.5, 300000.6, 300000.55]),
+        ("t", np.array([0, 100, 50], np.uint32)),
+        ("timestamp", np.array([0, 100, 50], np.uint64) + np.uint64(1_700_000_000_000_000_000)),
+        ("offset_time", [-0.1, 0.0, np.nan]),
+    ],
+)
+def test_times_in_any_unit(name, values):
+    cloud = PointCloud(np.zeros((3, 3)), {"intensity": np.ones(3), name: np.asarray(values)})
+    assert scan_times(cloud) == pytest.approx([0, 1, 0.5], abs=1e-6)
+
+
+def test_one_time_for_all_points_is_an_error():
+    with pytest.raises(CloudFileError, match="field time is the same for all points"):
+        scan_times(PointCloud(np.zeros((3, 3)), {"time": np.ones(3)}))

@@ -1,0 +1,87 @@
+"""Odometry: as exact as the data allow, in any unit, from any start, and honest where it is lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from simulation import drive, make_street, scan
+
+from fmr_cli.io import read_cloud, read_poses
+from fmr_cli.sequence.odometry import Odometry, choose_voxel
+
+REFERENCE = "reference_poses.txt"
+
+
+@pytest.fixture(scope="session")
+def turning():
+    """Scans and poses of a drive through a bend at 40 deg/s, in motion from the first scan on; two of them at rest."""
+    place, poses, rng = make_street(60), drive(60)[20:50], np.random.default_rng(2)
+    return [scan(place, pose, rng, columns=450) for pose in poses], poses
+
+
+def run(scans, **settings):
+    odometry = Odometry(choose_voxel(scans[0]), np.median(scans[0], axis=0), **settings)
+    return [odometry.register(odometry.prepare(points)) for points in scans]
+
+
+def errors(frames, truth):
+    """Shift of each frame from the truth, as a share of the path so far; and the first step's shift alone."""
+    truth = np.linalg.inv(truth[0]) @ truth
+    shift = np.linalg.norm([f.pose[:3, 3] - T[:3, 3] for f, T in zip(frames, truth, strict=True)], axis=1)
+    length = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+    return shift[-1] / length, shift[1]
+
+
+def test_a_bend_is_followed_to_two_thousandths_of_its_length(turning):
+    scans, truth = turning
+    frames = run(scans)
+    assert all(frame.status == "aligned" for frame in frames)
+    drift, first = errors(frames, truth)
+    assert drift < 0.002
+    assert first < 0.02
+
+
+@pytest.mark.parametrize("every", [-1, 3])
+def test_backwards_and_every_third_scan(turning, every):
+    scans, truth = turning
+    frames = run(scans[::every])
+    assert all(frame.status == "aligned" for frame in frames)
+    assert errors(frames, truth[::every])[0] < 0.004
+
+
+def test_the_unit_and_the_place_do_not_matter(turning):
+    scans, truth = turning[0][:6], turning[1][:6]
+    far = np.array([600_000.0, 5_000_000.0, 100.0])
+    metres, millimetres = run(scans), run([points * 1000 for points in scans])
+    for a, b in zip(metres, millimetres, strict=True):
+        assert np.allclose(a.pose[:3, 3] * 1000, b.pose[:3, 3], atol=1.0)
+    shifted = run([points + far for points in scans])
+    moved = np.array([frame.pose[:3, :3] @ far + frame.pose[:3, 3] - far for frame in shifted])
+    true = (np.linalg.inv(truth[0]) @ truth)[:, :3, 3]
+    assert np.abs(moved - true).max() < 0.05
+
+
+def test_the_same_scans_give_the_same_poses_bit_for_bit(turning):
+    scans = turning[0][:6]
+    for a, b in zip(run(scans), run(scans), strict=True):
+        assert np.array_equal(a.pose, b.pose)
+
+
+def test_a_missing_scan_is_bridged_by_the_motion_before(turning):
+    scans, truth = turning[0][:10], turning[1][:10]
+    odometry = Odometry(choose_voxel(scans[0]), np.median(scans[0], axis=0))
+    frames = [odometry.register(None if i == 6 else odometry.prepare(points)) for i, points in enumerate(scans)]
+    assert [i for i, frame in enumerate(frames) if frame.status != "aligned"] == [6]
+    true = (np.linalg.inv(truth[0]) @ truth)[:, :3, 3]
+    assert np.linalg.norm(frames[6].pose[:3, 3] - true[6]) < 0.3
+    assert np.linalg.norm(frames[9].pose[:3, 3] - true[9]) < 0.05
+
+
+@pytest.mark.parametrize(("folder", "suffix"), [("kitti_seq/velodyne", ".bin"), ("hdl64", ".pcd")])
+def test_real_lidar(shared_data, folder, suffix):
+    home = shared_data / folder
+    truth = read_poses(next(p for p in (home, home.parent) if (p / REFERENCE).exists()) / "reference_poses.txt")
+    scans = [read_cloud(p, attributes=False).points for p in sorted(home.glob(f"*{suffix}"))[:8]]
+    drift, first = errors(run(scans), truth[:8])
+    assert drift < 0.004
+    assert first < 0.02
