@@ -24,10 +24,11 @@ from scipy.spatial.transform import Rotation
 from benchmarks.common import PEERS, Way
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.io import read_cloud
+from fmr_cli.registration.hypotheses import Hypothesis, from_features, from_search
 from fmr_cli.registration.options import Options
-from fmr_cli.registration.pair import Pair, Start
-from fmr_cli.registration.pipeline import local_pose, make_pair
+from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.refinement import refined
 from fmr_cli.synthetic.pairs import scan_pair
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, target, T_target_source
@@ -61,13 +62,14 @@ def from_folder(folder: Path, count: int, seed: int) -> Iterator[Problem]:
         yield turned(*pairs[i], rng)
 
 
-def peer(start: Callable[[float], Way], pair: Pair) -> list[Start]:
+def peer(start: Callable[[float], Way], pair: Pair) -> list[Hypothesis]:
     """Where another tool would start, told the pair's voxel edge."""
-    return [Start(start(pair.edge)(pair.source.points, pair.target.points), "features", [])]
+    T = start(pair.edge)(pair.source.points, pair.target.points)
+    return [Hypothesis(T, "features", pair.overlap_score(T))]
 
 
-def starts() -> dict[str, Callable[[Pair], list[Start]]]:
-    made: dict[str, Callable[[Pair], list[Start]]] = {"search": Pair.from_search, "features": Pair.from_features}
+def starts() -> dict[str, Callable[[Pair], list[Hypothesis]]]:
+    made: dict[str, Callable[[Pair], list[Hypothesis]]] = {"search": from_search, "features": from_features}
     for name, start in PEERS.items():
         try:
             start(1.0)
@@ -89,15 +91,14 @@ def main() -> None:
     for source, target, truth in problems:
         for name, way in ways.items():  # each prepares the clouds anew, and so pays for its own features
             pair = make_pair(Prepared(PointCloud(source)), Prepared(PointCloud(target)), Options())
-            T = local_pose(truth, pair)
+            T = pair.enter_centred(truth)
             begin = time.perf_counter()
             found = way(pair)
             took = time.perf_counter() - begin
-            best = max(found, key=lambda s: pair.coincidence(s.T)) if found else Start(np.eye(4), name, [])
-            refined = pair.candidate(best, polished=True, scale=False).T
+            best = max(found, key=lambda h: h.score) if found else Hypothesis(np.eye(4), name)
             errors = [
                 (angle_degrees(np.linalg.inv(T) @ X), np.linalg.norm((X - T)[:3, 3]) / pair.edge)
-                for X in (best.T, refined)
+                for X in (best.T_target_source, refined(pair, best))
             ]
             rows[name].append((errors[0][0] < 15 and errors[0][1] < 6, errors[1][0] < 5 and errors[1][1] < 2, took))
     print(f"{'start':16s} pairs  found  refined  median s")

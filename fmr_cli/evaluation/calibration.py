@@ -26,10 +26,13 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.voxels import cell_numbers
+from fmr_cli.registration import hypotheses
+from fmr_cli.registration.confidence import Judge
 from fmr_cli.registration.options import Options
-from fmr_cli.registration.pair import Candidate
-from fmr_cli.registration.pipeline import REFINED, local_pose, make_pair
+from fmr_cli.registration.pair import KEYPOINTS, make_pair
+from fmr_cli.registration.pipeline import COARSE_KEYPOINTS, COARSENESS, REFINED
 from fmr_cli.registration.prepared import Prepared, pair_edge
+from fmr_cli.registration.refinement import refined
 from fmr_cli.synthetic import scenes, shapes
 from fmr_cli.synthetic.pairs import degrade, scan_pair
 
@@ -133,20 +136,20 @@ def poses(seed: tuple[int, int]) -> list[tuple[np.ndarray, bool]]:
     kind = seed[1] % len(KINDS)
     try:
         prepared = Prepared(PointCloud(transform_points(move, source))), Prepared(PointCloud(target))
-        pair = make_pair(*prepared, Options(seed=seed[1]), coarse=kind == 0)
+        coarseness, keypoints = (COARSENESS, COARSE_KEYPOINTS) if kind == 0 else (1.0, KEYPOINTS)
+        pair = make_pair(*prepared, Options(seed=seed[1]), coarseness=coarseness, keypoints=keypoints)
     except RegistrationError:  # a street and a teacup: nothing to judge
         return []
-    truth = local_pose(np.linalg.inv(move), pair)
-    candidates: list[Candidate] = []
+    truth = pair.enter_centred(np.linalg.inv(move))
+    features = hypotheses.from_features(pair)
+    judge = Judge(pair, [(h.T_target_source, h.score) for h in [*features, *hypotheses.by_chance(pair)]])
     for name in KINDS[kind]:
-        starts = getattr(pair, f"from_{name}")
-        for start in sorted(starts(), key=lambda s: -pair.coincidence(s.T))[:REFINED]:
-            candidate = pair.candidate(start, polished=True, scale=False)
-            if not any(pair.same(candidate.T, c.T) for c in candidates):
-                candidates.append(candidate)
+        made = features if name == "features" else hypotheses.from_search(pair)
+        for hypothesis in sorted(made, key=lambda h: -h.score)[:REFINED]:
+            judge.consider(refined(pair, hypothesis), hypothesis.start, hypothesis.errors)
     found = []
-    for c in candidates:
-        error = np.linalg.inv(truth) @ c.T
+    for c in judge.candidates:
+        error = np.linalg.inv(truth) @ c.T_target_source
         near = np.linalg.norm(error[:3, 3]) < RIGHT_EDGES * pair_edge(*prepared)
         found.append((c.evidence.vector(), bool(together and near and angle_degrees(error) < RIGHT_DEGREES)))
     return found

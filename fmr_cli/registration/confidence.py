@@ -7,11 +7,13 @@ weights come from ``python -m benchmarks.calibrate``, fitted on procedural scene
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from fmr_cli.geometry.surface import Surface
+from fmr_cli.registration.pair import Pair
 
 ALIGNED = 0.5  # confidence from which a pose is called aligned
 TOUCHING = 1.5  # voxel edges
@@ -83,3 +85,63 @@ def odds(evidence: Evidence) -> float:
 def confidences(odds: Sequence[float]) -> list[float]:
     """The probability of each of several distinct poses, of which at most one is right: the odds share out 1."""
     return [o / (1 + sum(odds)) for o in odds]
+
+
+@dataclass
+class Candidate:
+    """A refined pose between the centred frames, with what speaks for it.
+
+    start: where it came from; errors: mean |r| of the IC solver that led to it. confidence: that it is right, given the
+    other candidates; set once these are known.
+    """
+
+    T_target_source: np.ndarray
+    start: str
+    errors: list[float]
+    evidence: Evidence
+    confidence: float = 0.0
+
+    @cached_property
+    def odds(self) -> float:
+        return odds(self.evidence)
+
+
+@dataclass
+class Judge:
+    """Weighs the poses of one pair against each other.
+
+    rivals: poses, each with its overlap score, that a right pose has to fit better than: those that matches agree on,
+    and some as good as random.
+    """
+
+    pair: Pair
+    rivals: list[tuple[np.ndarray, float]] = field(default_factory=list)
+    candidates: list[Candidate] = field(default_factory=list)
+
+    def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:
+        """Gather the evidence at a pose, and weigh all candidates anew."""
+        T = T_target_source
+        others = [score for rival, score in self.rivals if not self.pair.same(T, rival)]
+        evidence = Evidence(
+            **fit(self.pair.s, self.pair.t, T),
+            votes=self.pair.inlier_count(T),
+            fit_over_rival=self.pair.overlap_score(T) / max(*others, 1e-3),
+        )
+        self.candidates = weighed([*self.candidates, Candidate(T, start, errors, evidence)], self.pair)
+
+    @property
+    def best(self) -> Candidate:
+        return self.candidates[0]
+
+    def sure(self, confidence: float) -> bool:
+        """Whether the best candidate has that confidence."""
+        return bool(self.candidates) and self.best.confidence >= confidence
+
+
+def weighed(candidates: list[Candidate], pair: Pair) -> list[Candidate]:
+    """The candidates, best first, without those that are a better one's pose; each confidence given the others."""
+    kept: list[Candidate] = []
+    for c in sorted(candidates, key=lambda c: -c.odds):
+        if not any(pair.same(c.T_target_source, k.T_target_source) for k in kept):
+            kept.append(c)
+    return [replace(c, confidence=p) for c, p in zip(kept, confidences([c.odds for c in kept]), strict=True)]

@@ -7,31 +7,34 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
 from fmr_cli.errors import RegistrationError
+from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.gicp import GicpCloud
 from fmr_cli.geometry.sampling import distinct, sample, thinned, working_scale
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_downsample
+from fmr_cli.registration.memo import Memo
 
-MIN_POINTS = 10
+MIN_POINTS = 10  # fewer say nothing about a surface
 AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more in every voxel
 SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxels
 LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
+KEPT = 6  # results of each kind that a cloud keeps: the grids and features of one pair, for its next pair
 
 
 class Prepared:
-    """A cloud made ready for registration; what is computed from it is kept, so that a batch pays for it once.
+    """A cloud made ready for registration; what is computed from it is kept, within bounds, for its next pair.
 
-    points: (N, 3) float64 about ``centre`` (their mean), at most AT_MOST, finite and distinct. edge: the voxel edge
-    that suits this cloud; spacing: of its points. Raises RegistrationError: fewer than 10 distinct points, all in one
-    place.
+    points: (N, 3) float64, centred, at most AT_MOST, finite and distinct. frame: the centred coordinates, whose origin
+    is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. Raises
+    RegistrationError: fewer than 10 distinct points, all in one place.
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         points = thinned(cloud.points, AT_MOST, rng)
         points = points[np.isfinite(points).all(1)]
-        self.centre = points.mean(0) if len(points) else np.zeros(3)
-        points = distinct(points - self.centre)
+        self.frame = Frame(points.mean(0) if len(points) else np.zeros(3))
+        points = distinct(self.frame.enter(points))
         if len(points) == 1 and len(cloud) > 1:
             raise RegistrationError(f"{cloud.name}: all {len(cloud)} points are in one place; give a scan of a surface")
         if len(points) < MIN_POINTS:
@@ -41,44 +44,48 @@ class Prepared:
         self.name, self.read, self.seed = cloud.name, len(cloud), seed
         self.points = points
         self.edge, self.spacing = working_scale(self.points, rng)
-        self._surfaces: dict[float, Surface] = {}
-        self._described: dict[tuple[float, int], tuple[np.ndarray, np.ndarray]] = {}
-        self._fine: dict[tuple[int, float], np.ndarray] = {}
-        self._gicp: dict[tuple[int, float, bool], GicpCloud] = {}
+        self._surfaces, self._described, self._fine, self._gicp = (Memo(KEPT) for _ in range(4))
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) where the centred coordinates have their origin, file's coordinates."""
+        return self.frame.origin
 
     def scaled(self, factor: float) -> Prepared:
         """The same cloud with every length multiplied by ``factor``."""
-        return Prepared(PointCloud((self.points + self.centre) * factor), self.seed)
+        return Prepared(PointCloud(self.frame.leave(self.points) * factor), self.seed)
 
     def surface(self, edge: float) -> Surface:
-        """The cloud on a voxel grid of ``edge``, about ``centre``."""
-        if edge not in self._surfaces:
-            self._surfaces[edge] = Surface(self.points, edge)
-        return self._surfaces[edge]
+        """The centred cloud on a voxel grid of ``edge``."""
+        return self._surfaces.get(edge, lambda: Surface(self.points, edge))
 
     def described(self, edge: float, count: int, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
-        """At most ``count`` keypoints (K, 3) about ``centre`` and their descriptors (K, d)."""
-        if (edge, count) not in self._described:
+        """At most ``count`` keypoints (K, 3), centred, and their descriptors (K, d)."""
+
+        def describe() -> tuple[np.ndarray, np.ndarray]:
             surface = self.surface(edge)
             index = surface.keypoints(count)
-            patches = describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS))
-            self._described[edge, count] = surface.points[index], encoder(patches)
-        return self._described[edge, count]
+            return surface.points[index], encoder(describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS)))
+
+        return self._described.get((edge, count, id(encoder)), describe)
 
     def fine(self, count: int, edge: float) -> np.ndarray:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
-        if (count, edge) not in self._fine:
+
+        def thin() -> np.ndarray:
             points = self.points if len(self.points) <= 4 * count else voxel_downsample(self.points, edge / 2)
-            self._fine[count, edge] = sample(points, count, np.random.default_rng(self.seed))
-        return self._fine[count, edge]
+            return sample(points, count, np.random.default_rng(self.seed))
+
+        return self._fine.get((count, edge), thin)
 
     def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> GicpCloud:
         """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""
-        if (count, edge, own) not in self._gicp:
+
+        def make() -> GicpCloud:
             rng = np.random.default_rng(self.seed)
-            points = sample(self.points, count, rng) if own else self.fine(count, edge)
-            self._gicp[count, edge, own] = GicpCloud(points, edge, threads)
-        return self._gicp[count, edge, own]
+            return GicpCloud(sample(self.points, count, rng) if own else self.fine(count, edge), edge, threads)
+
+        return self._gicp.get((count, edge, own), make)
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import platform
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +14,12 @@ import numpy as np
 import scipy
 
 import fmr_cli
+from fmr_cli.cloud import angle_degrees, transform_points
+from fmr_cli.geometry import observability
+from fmr_cli.registration.confidence import ALIGNED, Candidate
 from fmr_cli.registration.options import Options
+from fmr_cli.registration.pair import Pair
+from fmr_cli.registration.prepared import Prepared
 
 
 @dataclass
@@ -56,8 +64,8 @@ class Registration:
     evidence: dict[str, float]
     voxel_size: float
     points: dict[str, int]
-    seconds: dict[str, float]
     options: Options
+    seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
@@ -66,6 +74,72 @@ class Registration:
         options = plain(asdict(self.options))
         said |= {"iterations": max(len(self.feature_errors) - 1, 0), "options": options, "versions": versions()}
         return said
+
+
+def describe(
+    pair: Pair, best: Candidate, others: list[Candidate], source: Prepared, factor: float, options: Options
+) -> Registration:
+    """The best candidate in the files' coordinates, with its covariance and alternatives.
+
+    source: as it came; pair.source is that, every length multiplied by ``factor``.
+    """
+    T = pair.leave_centred(best.T_target_source)
+    T[:3, :3] *= factor
+    info = observability.information(pair.s, pair.t, best.T_target_source, np.zeros(3))
+    alternatives = [
+        {
+            "T_target_source": pair.leave_centred(c.T_target_source).tolist(),
+            "confidence": c.confidence,
+            "feature_error": pair.feature_error(c.T_target_source),
+        }
+        for c in others
+        if c.odds >= 1  # by itself more likely right than not
+    ]
+    read = {"source": source.read, "target": pair.target.read}
+    return Registration(
+        T_target_source=T,
+        status="aligned" if best.confidence >= ALIGNED else "uncertain",
+        confidence=best.confidence,
+        overlap=best.evidence.overlap,
+        inlier_rmse=best.evidence.inlier_rmse,
+        feature_error_before=pair.feature_error(pair.enter_centred(np.eye(4))),
+        feature_error_after=pair.feature_error(best.T_target_source),
+        feature_errors=best.errors,
+        start=best.start,
+        angle=angle_degrees(T),
+        shift=float(np.linalg.norm(transform_points(T, source.centre[None])[0] - source.centre)),
+        scale=float(np.cbrt(np.linalg.det(T[:3, :3]))),
+        information=info,
+        covariance=np.linalg.pinv(info, rcond=1e-12, hermitian=True),
+        origin=pair.target.centre,
+        undetermined=observability.undetermined(info, pair.boxes[1].unit / 2),
+        alternatives=alternatives,
+        evidence=asdict(best.evidence),
+        voxel_size=pair.edge,
+        points={**read, "source_used": len(pair.s.points), "target_used": len(pair.t.points)},
+        options=options,
+        warnings=["other poses fit about as well, see alternatives"] if alternatives else [],
+    )
+
+
+class Stopwatch:
+    """Wall time by stage, and since it was made."""
+
+    def __init__(self) -> None:
+        self.begin = time.perf_counter()
+        self.stages: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the wall time of its block to the stage's."""
+        start = time.perf_counter()
+        yield
+        self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Of every stage, and "total"."""
+        return {**self.stages, "total": time.perf_counter() - self.begin}
 
 
 def plain(value: Any) -> Any:

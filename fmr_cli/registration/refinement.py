@@ -1,0 +1,119 @@
+"""From a hypothesis to a pose: the feature metric of local patches, then geometry, coarse to fine.
+
+Poses are between the centred frames of a ``Pair``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fmr_cli.cloud import transform_points
+from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
+from fmr_cli.geometry.gicp import GicpCloud, gicp
+from fmr_cli.geometry.point_to_plane import constrained
+from fmr_cli.geometry.sampling import sample
+from fmr_cli.geometry.surface import Surface
+from fmr_cli.registration.hypotheses import Hypothesis
+from fmr_cli.registration.pair import RANKING_POINTS, Pair
+from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS
+
+LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; GICP does the rest
+FINE = LEVELS[1:]
+PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, IC iterations, points of a patch
+GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
+GICP_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
+EXACT_TARGET = 200_000  # points of the target that the winner is refined against once more, each its own
+FINER = 4.0  # times the grid of the last step on large clouds, where they are dense enough
+COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
+
+
+def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
+    """The pose that a hypothesis leads to, by what the options ask for."""
+    T = pair.motion.exact(hypothesis.T_target_source)
+    if hypothesis.start != "features":
+        T = by_patches(pair, T, LEVELS)
+    elif not pair.options.refine:  # else GICP alone comes as far from within CONSENSUS_TOLERANCE
+        T = by_patches(pair, T, FINE)
+    return by_geometry(pair, T) if pair.options.refine else T
+
+
+def by_patches(pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
+    """The pose after the feature metric of local patches, from coarse to fine."""
+    length = pair.boxes[1].unit
+    g = T_target_source.copy()
+    g[:3, 3] /= length
+    for radius, coarseness in levels:
+        s, t = (cloud.surface(pair.edge * coarseness) for cloud in (pair.source, pair.target))
+        reach = radius * pair.edge
+        centres = patch_centres(pair, s, t, g, reach) / length
+        template = patch_template(pair.encoder.layers, centres, balls(t, reach, length), reach / length)
+        look = balls(s, reach, length)
+        g = refine(pair.encoder.layers, template, look, g, PATCH_ITERATIONS, pair.motion.basis()).g
+    g[:3, 3] *= length
+    return g
+
+
+def patch_centres(pair: Pair, s: Surface, t: Surface, g: np.ndarray, reach: float) -> np.ndarray:
+    """Points of the target, spread evenly, that the source comes near to at g: (P, 3)."""
+    some = sample(t.points, 6 * PATCHES, np.random.default_rng(pair.seed))
+    back = (some - g[:3, 3] * pair.boxes[1].unit) @ g[:3, :3]
+    common = some[np.isfinite(s.tree.query(back, distance_upper_bound=reach / 2)[0])]
+    return (common if len(common) >= 8 else some)[:PATCHES]
+
+
+def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
+    """Look-ups for ``feature_metric.patches``: centres in units of ``length``, balls of ``radius`` (own unit)."""
+
+    def look(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return surface.around(centres * length, radius, BALL_POINTS)[:2]
+
+    return look
+
+
+def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+    """The pose after GICP, or after point-to-plane within the options' motions and scale."""
+    if pair.options.scale or pair.motion.dof != "rigid":
+        s, t = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge)
+        return constrained(s, t, T_target_source, pair.edge, pair.motion.basis(), pair.options.scale)
+    target = pair.target.for_gicp(GICP_TARGET, pair.edge, pair.threads)
+    return gicp_in_reach(pair, pair.source.fine(GICP_SOURCE, pair.edge), target, T_target_source)
+
+
+def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_source: np.ndarray) -> np.ndarray:
+    """GICP of those of the source's points that are in reach of the target."""
+    moved = transform_points(T_target_source, source)
+    near = source[np.isfinite(pair.t.tree.query(moved, distance_upper_bound=GICP_REACH * pair.edge)[0])]
+    if len(near) < MIN_POINTS:
+        return T_target_source
+    return gicp(GicpCloud(near, pair.edge, pair.threads), target, T_target_source, pair.edge)
+
+
+def exact(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+    """The pose after GICP on more than the step before saw, where there is more.
+
+    Scans that have points in common come to coincide, point by point; otherwise a grid is the better mean, of large
+    scans a finer one.
+    """
+    source, target, T = pair.source, pair.target, T_target_source
+    if pair.motion.dof != "rigid" or len(target.points) <= GICP_TARGET:
+        return T
+    if len(target.points) <= 4 * EXACT_TARGET and in_common(pair, T):
+        some = sample(source.points, GICP_SOURCE, np.random.default_rng(pair.seed))
+        return gicp_in_reach(pair, some, target.for_gicp(EXACT_TARGET, pair.edge, pair.threads, own=True), T)
+    fine = max(pair.edge / FINER, SPACINGS * source.spacing, SPACINGS * target.spacing)
+    if min(len(source.points), len(target.points)) < EXACT_TARGET or fine > pair.edge / 2:
+        return T
+    some = sample(source.surface(fine).points, GICP_SOURCE, np.random.default_rng(pair.seed))
+    whole = GicpCloud(target.surface(fine).points, fine, pair.threads)
+    return gicp(GicpCloud(some, fine, pair.threads), whole, T, fine)
+
+
+def in_common(pair: Pair, T_target_source: np.ndarray) -> bool:
+    """Whether most of a few points of the source have their like in the target."""
+    some = transform_points(
+        T_target_source, sample(pair.source.points, RANKING_POINTS, np.random.default_rng(pair.seed))
+    )
+    tree = cKDTree(pair.target.points, balanced_tree=False, compact_nodes=False)
+    distance = tree.query(some, distance_upper_bound=pair.edge)[0]
+    return bool(np.median(distance) <= COMMON * pair.target.spacing)
