@@ -10,7 +10,8 @@ import numpy as np
 
 from fmr_cli.geometry.motion import Motion, rotation_between
 
-SEEDS, NEIGHBOURS = 40, 20
+SEEDS, NEIGHBOURS = 60, 20
+POWER_STEPS = 4  # of the leading eigenvector: the order of the seeds has settled by then
 ROUNDS = 4  # of refitting a pose to its inliers
 APART = 0.26  # rad: poses nearer than this and within two tolerances are one
 
@@ -25,14 +26,12 @@ def consensus(
     if len(source) < 3:
         return np.zeros((0, 4, 4)), np.zeros(0, int)
     agree = (np.abs(distances(source) - distances(target)) < tolerance).astype(np.float32)
-    second = agree @ agree
-    second *= agree
-    T = poses_from_seeds(second, source, target, tolerance, motion, np.ones(len(source), np.float32))
+    T = poses_from_seeds(agree, source, target, tolerance, motion, np.ones(len(source), np.float32))
     # Again without the matches of the best pose, so that there is always another one to compare it with.
     near = residuals(T, source, target) < tolerance
     left = (~near[near.sum(1).argmax()]).astype(np.float32)
     if left.sum() >= 3:
-        T = np.concatenate([T, poses_from_seeds(second, source, target, tolerance, motion, left)])
+        T = np.concatenate([T, poses_from_seeds(agree, source, target, tolerance, motion, left)])
     inliers = (residuals(T, source, target) < tolerance).sum(1)
     kept: list[int] = []
     moved = T[:, :3, :3] @ source.mean(0) + T[:, :3, 3]
@@ -46,20 +45,44 @@ def consensus(
 
 
 def poses_from_seeds(
-    second: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, motion: Motion, use: np.ndarray
+    agree: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, motion: Motion, use: np.ndarray
 ) -> np.ndarray:
-    """A pose for each of the matches that most others agree with, fitted to its inliers: second (C, C) -> (S, 4, 4).
+    """A pose for each seed, fitted to its inliers: agree (C, C), 1 where two matches agree -> (S, 4, 4).
 
     use: (C,), 0 for matches that do not count.
     """
-    seeds = np.argsort(-(second @ use) * use, kind="stable")[: min(SEEDS, int(use.sum()))]
-    weight = second[seeds] * use
-    members = np.argpartition(-weight, min(NEIGHBOURS, len(source)) - 1, axis=1)[:, :NEIGHBOURS]
-    T = motion.fit(source[members], target[members], np.take_along_axis(weight, members, 1).astype(float))
+    seeds = spread_seeds(agree, source, target, tolerance, use)
+    second = (agree[seeds] @ agree) * agree[seeds] * use
+    members = np.argpartition(-second, min(NEIGHBOURS, len(source)) - 1, axis=1)[:, :NEIGHBOURS]
+    T = motion.fit(source[members], target[members], np.take_along_axis(second, members, 1).astype(float))
     for _ in range(ROUNDS):
         near = residuals(T, source, target) < tolerance
         T = motion.fit(source[None], target[None], (near + 1e-9) * use)
     return T
+
+
+def spread_seeds(
+    agree: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, use: np.ndarray
+) -> np.ndarray:
+    """The matches that most others agree with, of one place at most one: at most SEEDS indices.
+
+    By the leading eigenvector of ``agree`` (spectral matching, Leordeanu and Hebert 2005), from a few power steps.
+    """
+    weight = use
+    for _ in range(POWER_STEPS):
+        weight = (agree @ weight) * use
+        weight = weight / max(float(weight.max()), 1e-30)
+    seeds: list[int] = []
+    taken = use == 0
+    for i in np.argsort(-weight, kind="stable"):
+        if taken[i]:
+            continue
+        seeds.append(int(i))
+        if len(seeds) == SEEDS:
+            break
+        near = np.abs(source - source[i]).max(1) < tolerance
+        taken |= near & (np.abs(target - target[i]).max(1) < tolerance)
+    return np.array(seeds)
 
 
 def residuals(T: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:

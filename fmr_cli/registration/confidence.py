@@ -1,80 +1,45 @@
-"""Is the pose right? Evidence gathered at it, and the probability that it gives.
+"""Is a pose right? The evidence at it, the odds that this gives, and what other poses leave of them.
 
-The evidence is dimensionless: distances count in voxel edges, feature errors against the features' own size. The
-weights come from ``python -m benchmarks.calibrate``, fitted on procedural scenes that no test uses.
+The evidence is dimensionless. The weights come from ``python -m benchmarks.calibrate``, fitted on made-up scans that
+no test uses.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from fmr_cli.geometry.surface import Surface
+from fmr_cli.registration.agreement import Agreement, agreement
 from fmr_cli.registration.pair import Pair
 
-ALIGNED = 0.5  # confidence from which a pose is called aligned
-TOUCHING = 1.5  # voxel edges
-FLOOR = 0.01  # offsets in voxel edges, and turns: less than that is as good as none
+ALIGNED = 0.7  # confidence from which a pose is called aligned
+
+# `python -m benchmarks.calibrate --pairs 240 --seed 42000`
+WEIGHTS = np.array([-1.0, 0.8, 1.0, 0.5, 2.0, 1.0])
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What speaks for a pose.
+class Evidence(Agreement):
+    """What speaks for a pose: how the surfaces agree, and how many matches of local features do.
 
-    overlap: share of the smaller scan within TOUCHING of the other one. inlier_rmse: of those, own unit.
-    offset: how far touching points lie off each other's tangent planes, root mean square, over how far a surface's own
-        neighbours do.
-    turn: the mean of 1 - |cosine| between their normals, over the same. Both are about 1 or less where the scans are
-        samples of one surface, whatever its curvature and noise.
-    votes: how many matches of local features agree with the pose, whether or not it came from them.
-    fit_over_rival: the share of the source that coincides with the target, normals too, over the most at other poses:
-        those that matches agree on, and some as good as random.
+    votes: matches, whether or not the pose came from them.
     """
 
-    overlap: float
-    inlier_rmse: float
-    offset: float
-    turn: float
     votes: int
-    fit_over_rival: float
 
     def vector(self) -> np.ndarray:
         """What the logistic model sees, after a 1 for the intercept: of each kind of evidence, more is better."""
-        ratios = [1 / self.offset, 1 / self.turn, self.fit_over_rival]
-        return np.array([1.0, np.log1p(self.votes), *np.log(np.clip(ratios, 1e-2, 1e2))])
-
-
-def fit(source: Surface, target: Surface, T: np.ndarray) -> dict[str, float]:
-    """How the surfaces fit at T (4x4, source to target, in their frames), both on the same voxel edge.
-
-    Returns the ``Evidence`` that geometry gives: overlap, inlier_rmse, offset, turn.
-    """
-    shares, sums = [], np.zeros(6)
-    for a, b, g in ((source, target, T), (target, source, np.linalg.inv(T))):
-        moved = a.points @ g[:3, :3].T + g[:3, 3]
-        distance, index = b.tree.query(moved, distance_upper_bound=TOUCHING * target.edge)
-        here = np.flatnonzero(np.isfinite(distance))
-        there = index[here]
-        off = np.einsum("ni,ni->n", moved[here] - b.points[there], b.normals[there]) / target.edge
-        turn = 1 - np.abs(np.einsum("ni,ni->n", a.normals[here] @ g[:3, :3].T, b.normals[there]))
-        own_off, own_turn = b.unevenness[0][there] / target.edge, b.unevenness[1][there]
-        sums += [len(here), (distance[here] ** 2).sum(), off @ off, own_off @ own_off, turn.sum(), own_turn.sum()]
-        shares.append(len(here) / len(distance))
-    count = max(sums[0], 1.0)
-    square, off2, own_off2, turns, own_turns = sums[1:] / count
-    return {
-        "overlap": max(shares),
-        "inlier_rmse": float(np.sqrt(square)) if sums[0] else float("inf"),
-        "offset": float(np.sqrt((off2 + FLOOR**2) / (own_off2 + FLOOR**2))),
-        "turn": float((max(turns, 0) + FLOOR) / (own_turns + FLOOR)),
-    }
-
-
-# `python -m benchmarks.calibrate --pairs 240 --seed 42000`
-WEIGHTS = np.array([-7.358, 2.229, 2.275, 1.513, 2.211])
+        ratios = [
+            1 / self.offset, 1 / self.turn, (self.explained + 1) / (self.contradicted + 1),
+            max(self.explained_share, 1e-3),
+        ]  # fmt: skip
+        return np.array([1.0, np.log1p(self.votes), *np.log(np.clip(ratios, 1e-3, 1e3))])
 
 
 def odds(evidence: Evidence) -> float:
@@ -103,45 +68,39 @@ class Candidate:
 
     @cached_property
     def odds(self) -> float:
+        """``odds`` of its evidence."""
         return odds(self.evidence)
 
 
 @dataclass
 class Judge:
-    """Weighs the poses of one pair against each other.
-
-    rivals: poses, each with its overlap score, that a right pose has to fit better than: those that matches agree on,
-    and some as good as random.
-    """
+    """Weighs the poses of one pair against each other. candidates: distinct poses, best first."""
 
     pair: Pair
-    rivals: list[tuple[np.ndarray, float]] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
 
     def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:
         """Gather the evidence at a pose, and weigh all candidates anew."""
-        T = T_target_source
-        others = [score for rival, score in self.rivals if not self.pair.same(T, rival)]
-        evidence = Evidence(
-            **fit(self.pair.s, self.pair.t, T),
-            votes=self.pair.inlier_count(T),
-            fit_over_rival=self.pair.overlap_score(T) / max(*others, 1e-3),
-        )
-        self.candidates = weighed([*self.candidates, Candidate(T, start, errors, evidence)], self.pair)
+        found = agreement(self.pair.s, self.pair.t, T_target_source)
+        evidence = Evidence(**asdict(found), votes=self.pair.inlier_count(T_target_source))
+        new = Candidate(T_target_source, start, errors, evidence)
+        log.debug("%s: odds %.3g, %s", start, new.odds, evidence)
+        kept: list[Candidate] = []
+        for c in sorted([*self.candidates, new], key=lambda c: -c.odds):
+            if not any(self.pair.same(c.T_target_source, k.T_target_source) for k in kept):
+                kept.append(c)
+        shares = confidences([c.odds for c in kept])
+        self.candidates = [replace(c, confidence=p) for c, p in zip(kept, shares, strict=True)]
+
+    def knows(self, T_target_source: np.ndarray) -> bool:
+        """Whether a candidate has that pose already."""
+        return any(self.pair.same(T_target_source, c.T_target_source) for c in self.candidates)
 
     @property
     def best(self) -> Candidate:
+        """The candidate that is most likely right."""
         return self.candidates[0]
 
     def sure(self, confidence: float) -> bool:
         """Whether the best candidate has that confidence."""
         return bool(self.candidates) and self.best.confidence >= confidence
-
-
-def weighed(candidates: list[Candidate], pair: Pair) -> list[Candidate]:
-    """The candidates, best first, without those that are a better one's pose; each confidence given the others."""
-    kept: list[Candidate] = []
-    for c in sorted(candidates, key=lambda c: -c.odds):
-        if not any(pair.same(c.T_target_source, k.T_target_source) for k in kept):
-            kept.append(c)
-    return [replace(c, confidence=p) for c, p in zip(kept, confidences([c.odds for c in kept]), strict=True)]

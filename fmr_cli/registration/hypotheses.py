@@ -5,19 +5,24 @@ Poses are between the centred frames of a ``Pair``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
+from fmr_cli.cloud import transform_points
 from fmr_cli.descriptors.consensus import consensus
 from fmr_cli.feature_metric.search import STARTS, search
-from fmr_cli.geometry.motion import Motion, rotations
+from fmr_cli.geometry.motion import Motion
 from fmr_cli.registration.pair import CONSENSUS_TOLERANCE, Pair
 
-CONSENSUS_POSES = 5  # poses that matches agree on, at most
-CHANCE_POSES = 8  # poses as good as random, to compare with
+CONSENSUS_POSES = 10  # poses that matches agree on, at most
+RUNNERS_UP = 3  # of the other cloud's keypoints, after the one that a match goes to
+ELSEWHERE = 4.0  # voxel edges: a runner-up nearer to the match shows the same place
+RIVAL_SHARE = 0.15  # of the matches behind a pose that must have their like behind a rival
+RIVAL_MATCHES = 5  # at least: fewer agree by chance
+RIVAL_SCORE = 0.5  # of the pose's own overlap score, that a rival has at least
+RIVALS = 12  # at most: of a longer row, the nearest
+ORBIT = 24  # poses tried along what maps a cloud onto itself: a gear's turns, both ways along a facade
 
 
 @dataclass
@@ -71,23 +76,57 @@ def from_solver(pair: Pair, T_target_source: np.ndarray, start: str) -> list[Hyp
     return [Hypothesis(T, start, pair.overlap_score(T), found.errors[:, 0].tolist())]
 
 
-def by_chance(pair: Pair) -> list[Hypothesis]:
-    """Poses as good as random: rotations about the means."""
-    poses = [pair.leave_box(g) for g in rotations(CHANCE_POSES)]
-    return [Hypothesis(T, "chance", pair.overlap_score(T)) for T in poses]
+def rivals(pair: Pair, T_target_source: np.ndarray) -> list[Hypothesis]:
+    """Poses that fit as well as this one might, where the scene repeats itself: the nearest ones of its orbit.
+
+    The matches behind the pose have runners-up: other places that look alike. What pose these agree on, T', differs
+    from T by a motion S = T' T^-1 that maps the target (or, S' = T^-1 T', the source) onto itself: a period of a
+    facade, a turn of a gear. Where there is one there are its powers, S S T and S^-1 T, and its products with others.
+    """
+    x, y = runners_up(pair, T_target_source)
+    if len(x) < RIVAL_MATCHES:
+        return []
+    motion = Motion(pair.motion.dof, pair.motion.up, pair.motion.lift / pair.edge)
+    poses, counts = consensus(x / pair.edge, y / pair.edge, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)
+    poses[:, :3, 3] *= pair.edge
+    least = max(RIVAL_MATCHES, RIVAL_SHARE * pair.inlier_count(T_target_source))
+    back = np.linalg.inv(T_target_source)
+    generators = [T @ back for T, count in zip(poses, counts, strict=True) if count >= least]
+    generators += [np.linalg.inv(S) for S in generators]
+    found: list[Hypothesis] = []
+    tried = [T_target_source]
+    floor = RIVAL_SCORE * pair.overlap_score(T_target_source)
+    queue = [S @ T_target_source for S in generators]
+    while queue and len(tried) <= ORBIT and len(found) < RIVALS:
+        T = queue.pop(0)
+        if any(pair.same(T, other) for other in tried):
+            continue
+        tried.append(T)
+        score = pair.overlap_score(T)
+        if score >= floor and pair.allowed(T):
+            found.append(Hypothesis(T, "rival", score))
+            queue += [S @ T for S in generators]
+    return found
 
 
-def makers(
-    pair: Pair, init: str | np.ndarray, features: list[Hypothesis]
-) -> Iterator[tuple[str, Callable[[], list[Hypothesis]]]]:
-    """The kinds of start that ``Options.init`` asks for, in order: (stage, function). features: what that kind gave."""
-    name = init if isinstance(init, str) else "given"
-    if name in ("auto", "features"):
-        yield "features", lambda: features
-    if name in ("auto", "search"):
-        yield "search", partial(from_search, pair)
-    if name in ("given", "identity", "centroid"):  # as it is; where that does not fit, where the solver goes from it
-        T = np.asarray(init, float) if name == "given" else np.eye(4)
-        T = T if name == "centroid" else pair.enter_centred(T)  # the centred identity brings centroid onto centroid
-        yield "start", partial(from_pose, pair, T, name)
-        yield "solve", partial(from_solver, pair, T, name)
+def runners_up(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints that look like the ones behind a pose and lie elsewhere: source and target, (C, 3) each."""
+    (p, a), (q, b) = pair.described(pair.source), pair.described(pair.target)
+    moved = transform_points(T_target_source, p)
+    apart = distances_between(moved, q)
+    similarity = a @ b.T
+    behind = similarity.argmax(1), similarity.argmax(0)
+    tolerance = CONSENSUS_TOLERANCE * pair.edge
+    rows = np.flatnonzero(apart[np.arange(len(p)), behind[0]] < tolerance)
+    columns = np.flatnonzero(apart[behind[1], np.arange(len(q))] < tolerance)
+    similarity = np.where(apart < ELSEWHERE * pair.edge, -1.0, similarity)
+    forth = np.argsort(-similarity[rows], axis=1, kind="stable")[:, :RUNNERS_UP]
+    back = np.argsort(-similarity[:, columns], axis=0, kind="stable")[:RUNNERS_UP].T
+    i = np.concatenate([np.repeat(rows, forth.shape[1]), back.ravel()])
+    j = np.concatenate([forth.ravel(), np.repeat(columns, back.shape[1])])
+    return p[i], q[j]
+
+
+def distances_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """|a_i - b_j| of points (A, 3) and (B, 3): (A, B)."""
+    return np.sqrt(np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * a @ b.T, 0))

@@ -158,9 +158,13 @@ class Pair:
 
 
 def make_pair(
-    source: Prepared, target: Prepared, options: Options, threads: int = 1, *, coarseness: float = 1.0,
+    source: Prepared,
+    target: Prepared,
+    options: Options,
+    threads: int = 1,
+    coarseness: float = 1.0,
     keypoints: int = KEYPOINTS,
-) -> Pair:  # fmt: skip
-    """The two clouds at the voxel edge that the options say, else at ``coarseness`` times the one that suits both."""
-    edge = options.voxel_size or pair_edge(source, target) * coarseness
+) -> Pair:
+    """The two clouds at ``coarseness`` times the voxel edge that the options say, or else that suits both."""
+    edge = (options.voxel_size or pair_edge(source, target)) * coarseness
     return Pair(source, target, options, edge, keypoints, threads)

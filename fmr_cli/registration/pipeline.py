@@ -19,16 +19,19 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, refinement
 from fmr_cli.registration.confidence import Judge
+from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration, Stopwatch, describe
 
-REFINED = 3  # hypotheses that are refined, of each kind of start
-SURE = 0.95  # once a pose is that sure on coarse voxels, fine ones are not looked at
-SETTLED = 0.8  # once a pose is that sure, no other kind of start is tried, and of its own kind only ...
-RIVAL = 0.8  # ... those whose overlap score is nearly as high
-COARSENESS, COARSE_KEYPOINTS = 1.5, 250  # a first look on larger voxels, at fewer places, which is often sure already
+REFINED = 8  # hypotheses that are refined and judged, of each look
+WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
+SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
+LIKELY = 0.5  # a pose less likely than that has no need of rivals
+FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
+FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000))  # the looks after it, while none is sure
+ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
 log = logging.getLogger(__name__)
@@ -63,7 +66,8 @@ def align(
         best = judge.best
         if options.refine and not options.scale:
             with time.stage("polish"):
-                best = replace(best, T_target_source=refinement.exact(judge.pair, best.T_target_source))
+                T = refinement.by_geometry(judge.pair, best.T_target_source)
+                best = replace(best, T_target_source=refinement.exact(judge.pair, T))
         with time.stage("verdict"):
             found = describe(judge.pair, best, judge.candidates[1:], source, factor, options)
     found.seconds = time.seconds
@@ -71,39 +75,84 @@ def align(
 
 
 def look(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge:
-    """The poses that were found, weighed against each other: on coarse voxels where that leaves no doubt."""
+    """The poses that were found, weighed against each other; looks get dearer while none is sure."""
     if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None and not options.scale:
         with suppress(RegistrationError):  # too few voxels of that size
-            pair = make_pair(source, target, options, threads, coarseness=COARSENESS, keypoints=COARSE_KEYPOINTS)
-            judge = find(pair, replace(options, init="features"), time, at_most=1)
+            judge = Judge(make_pair(source, target, options, threads, *FIRST))
+            consider(judge, features(judge.pair, time), time)
             if judge.sure(SURE):
                 return judge
-    return find(make_pair(source, target, options, threads), options, time)
-
-
-def find(pair: Pair, options: Options, time: Stopwatch, at_most: int = REFINED) -> Judge:
-    """Hypotheses from the starts that the options name, refined and judged; "auto" goes on while none is settled."""
-    judge = Judge(pair)
-    with time.stage("describe"):
-        pair.describe()
-    with time.stage("features"):
-        features = hypotheses.from_features(pair)
-        judge.rivals = [(h.T_target_source, h.score) for h in [*features, *hypotheses.by_chance(pair)]]
-    for start, make in hypotheses.makers(pair, options.init, features):
-        with time.stage(start):
-            ranked = sorted((h for h in make() if pair.allowed(h.T_target_source)), key=lambda h: -h.score)
-        with time.stage("refine"):
-            for rank, hypothesis in enumerate(ranked):
-                if (rank >= at_most or judge.sure(SETTLED)) and hypothesis.score < RIVAL * ranked[0].score:
-                    break
-                T = refinement.refined(pair, hypothesis)
-                if pair.allowed(T):
-                    judge.consider(T, hypothesis.start, hypothesis.errors)
-        if judge.sure(SETTLED):
-            break
+    judge = Judge(make_pair(source, target, options, threads, *FURTHER[0]))
+    pair = judge.pair
+    if not isinstance(options.init, str) or options.init in ("identity", "centroid"):
+        return from_given(judge, options.init, time)
+    if options.init != "search":
+        for coarseness, keypoints in FURTHER:
+            with suppress(RegistrationError):
+                seen = pair if coarseness == 1.0 else make_pair(source, target, options, threads, coarseness, keypoints)
+                consider(judge, features(seen, time), time)
+            if judge.sure(SURE):
+                return judge
+    if options.init == "search" or (options.init == "auto" and may_overlap_fully(pair)):
+        with time.stage("search"):
+            found = hypotheses.from_search(pair)
+        consider(judge, found, time)
     if not judge.candidates:  # every pose found lies beyond the options' max_angle or max_shift
         judge.consider(pair.enter_centred(np.eye(4)), "identity", [])
     return judge
+
+
+def from_given(judge: Judge, init: str | np.ndarray, time: Stopwatch) -> Judge:
+    """A pose that is given, as it is; where that does not fit, where the paper's solver goes from it."""
+    pair, name = judge.pair, init if isinstance(init, str) else "given"
+    T = np.eye(4) if isinstance(init, str) else np.asarray(init, float)
+    T = T if name == "centroid" else pair.enter_centred(T)  # the centred identity brings centroid onto centroid
+    consider(judge, hypotheses.from_pose(pair, T, name), time)
+    if not judge.sure(SURE):
+        with time.stage("solve"):
+            found = hypotheses.from_solver(pair, T, name)
+        consider(judge, found, time)
+    if not judge.candidates:
+        judge.consider(T, name, [])
+    return judge
+
+
+def features(pair: Pair, time: Stopwatch) -> list[Hypothesis]:
+    """Hypotheses from the local features of a pair."""
+    with time.stage("describe"):
+        pair.describe()
+    with time.stage("features"):
+        return hypotheses.from_features(pair)
+
+
+def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch) -> None:
+    """Refine and judge the hypotheses that are worth it, best first, and the rivals of what then is likely."""
+    pair = judge.pair
+    with time.stage("refine"):
+        ranked = sorted((h for h in found if pair.allowed(h.T_target_source)), key=lambda h: -h.score)
+        for hypothesis in ranked[:REFINED]:
+            if hypothesis.score >= WORTH * ranked[0].score and not judge.knows(hypothesis.T_target_source):
+                judge_refined(judge, hypothesis)
+    with time.stage("rivals"):
+        if judge.sure(LIKELY):
+            for hypothesis in hypotheses.rivals(pair, judge.best.T_target_source):
+                if not judge.knows(hypothesis.T_target_source):
+                    judge_refined(judge, hypothesis)
+
+
+def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
+    """Judge the pose that a hypothesis leads to, if the options allow it."""
+    T = refinement.refined(judge.pair, hypothesis)
+    if judge.pair.allowed(T):
+        judge.consider(T, hypothesis.start, hypothesis.errors)
+
+
+def may_overlap_fully(pair: Pair) -> bool:
+    """Whether the clouds are of one size along each of their principal axes."""
+    s, t = (
+        np.linalg.svd(x.points - x.points.mean(0), compute_uv=False) / np.sqrt(len(x.points)) for x in (pair.s, pair.t)
+    )
+    return bool((np.maximum(s, t) <= ALIKE * np.minimum(s, t) + pair.edge).all())
 
 
 def scales(source: Prepared, target: Prepared, options: Options) -> Iterator[tuple[float, Options]]:

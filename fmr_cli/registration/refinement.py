@@ -9,9 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fmr_cli.cloud import transform_points
+from fmr_cli.feature_metric.fast import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.geometry.gicp import GicpCloud, gicp
-from fmr_cli.geometry.point_to_plane import constrained
+from fmr_cli.geometry.motion import exp
+from fmr_cli.geometry.point_to_plane import constrained, point_to_plane
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.hypotheses import Hypothesis
@@ -21,6 +23,8 @@ from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS
 LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; GICP does the rest
 FINE = LEVELS[1:]
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, IC iterations, points of a patch
+PLANE_REACHES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.0, 1.0)  # voxel edges, a step each
+DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
 GICP_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
 EXACT_TARGET = 200_000  # points of the target that the winner is refined against once more, each its own
@@ -29,13 +33,13 @@ COMMON = 0.25  # spacings, within which most points have their counterpart if th
 
 
 def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
-    """The pose that a hypothesis leads to, by what the options ask for."""
+    """The pose that a hypothesis leads to, near enough to be judged; cheap, so that many can be."""
     T = pair.motion.exact(hypothesis.T_target_source)
-    if hypothesis.start != "features":
+    if hypothesis.start not in ("features", "rival"):  # these are near already
         T = by_patches(pair, T, LEVELS)
-    elif not pair.options.refine:  # else GICP alone comes as far from within CONSENSUS_TOLERANCE
-        T = by_patches(pair, T, FINE)
-    return by_geometry(pair, T) if pair.options.refine else T
+    if not pair.options.refine:
+        return T if hypothesis.errors else by_patches(pair, T, FINE)
+    return by_geometry(pair, T) if pair.options.scale else by_planes(pair, T)
 
 
 def by_patches(pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
@@ -69,6 +73,19 @@ def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
         return surface.around(centres * length, radius, BALL_POINTS)[:2]
 
     return look
+
+
+def by_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+    """The pose after robust point-to-plane steps on a few voxels, from far to near: what a hypothesis is judged at."""
+    points, basis, T = pair.some[0], pair.motion.basis(), T_target_source
+    pivot = np.zeros(3)
+    for reach in PLANE_REACHES:
+        normal = point_to_plane(points, pair.t.points, pair.t.normals, pair.t.tree, T, reach * pair.edge, pivot)
+        if normal.count < MIN_POINTS:
+            return T
+        step = constrained_step(normal.A[:6, :6] + DAMPING * np.diag(np.diag(normal.A)[:6]), -normal.b[:6], basis)
+        T = exp(step) @ T
+    return T
 
 
 def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:

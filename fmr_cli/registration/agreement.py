@@ -1,0 +1,78 @@
+"""How two surfaces agree at a pose: what each explains of the other, and what contradicts it.
+
+Only the common region speaks: a point that lies over a part of the other surface, not beyond its border. There it is
+explained if it lies on that surface and faces along with it, and contradicted if it floats above or below, or
+faces across: the other scan saw a surface here and not this one. So the border of a scan, which is where the sensor's
+view ends, says nothing. Distances count in voxel edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.surface import Surface
+
+REACH = 4.0  # voxel edges: further off, a point is no business of a surface: a table does not contradict the floor
+TOUCHING = 1.5  # voxel edges: nearer points overlap, as voxels of one surface do
+OVER = 1.0  # voxel edges along the tangent plane, within which a point lies over a surface point
+CLEAR, UNEVEN = 0.5, 2.5  # voxel edges, and times the surface's own unevenness: an offset beyond both contradicts
+ALONG, ACROSS = 0.7, 0.4  # |cosine| between normals: from one on they agree, below the other they contradict
+FLOOR = 0.01  # offsets in voxel edges, and turns: less than that is as good as none
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What two surfaces say of a pose, both ways taken together.
+
+    explained, contradicted: points, of both. overlap: share of the smaller scan within TOUCHING of the other one.
+    explained_share: the same, of points that are explained. inlier_rmse: of touching points, own unit.
+    offset: how far these lie off each other's tangent planes, root mean square, over how far a surface's own
+        neighbours do. turn: the mean of 1 - |cosine| between their normals, over the same. Both are about 1 or less
+        where the scans are samples of one surface, whatever its curvature and noise.
+    """
+
+    explained: int
+    contradicted: int
+    overlap: float
+    explained_share: float
+    inlier_rmse: float
+    offset: float
+    turn: float
+
+
+def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> Agreement:
+    """Compare two surfaces on the same voxel edge at a pose between their frames."""
+    shares, explained_shares, sums = [], [], np.zeros(8)
+    for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
+        moved = transform_points(T, a.points)
+        distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
+        here = np.flatnonzero(np.isfinite(distance))
+        there, d = index[here], distance[here] / b.edge
+        n = b.normals[there]
+        off = np.abs(np.einsum("ni,ni->n", moved[here] - b.points[there], n)) / b.edge
+        cosine = np.abs(np.einsum("ni,ni->n", a.normals[here] @ T[:3, :3].T, n))
+        own_off, own_turn = b.unevenness[0][there] / b.edge, b.unevenness[1][there]
+        over = d * d - off * off < OVER**2
+        clear = off > np.maximum(CLEAR, UNEVEN * np.maximum(own_off, a.unevenness[0][here] / a.edge))
+        explained = over & ~clear & (cosine > ALONG)
+        touching = d < TOUCHING
+        contradicted = over & (clear | (touching & (cosine < ACROSS) & (own_turn < 1 - ALONG)))
+        sums += [
+            explained.sum(), contradicted.sum(), touching.sum(), (d[touching] ** 2).sum(), (off[touching] ** 2).sum(),
+            (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
+        ]  # fmt: skip
+        shares.append(touching.sum() / len(moved))
+        explained_shares.append(explained.sum() / len(moved))
+    square, off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
+    return Agreement(
+        explained=int(sums[0]),
+        contradicted=int(sums[1]),
+        overlap=float(max(shares)),
+        explained_share=float(max(explained_shares)),
+        inlier_rmse=float(np.sqrt(square)) * target.edge if sums[2] else float("inf"),
+        offset=float(np.sqrt((off2 + FLOOR**2) / (own_off2 + FLOOR**2))),
+        turn=float((max(turns, 0) + FLOOR) / (own_turns + FLOOR)),
+    )
