@@ -92,8 +92,9 @@ def learn(trainer: Trainer, show: Callable[..., None], quiet: bool) -> bool:
             show(description="training", completed=report.step, total=report.steps, said=line(report))
             if report.row:
                 say(epoch_line(report.row), quiet=quiet)
-            for name, value in (report.row or {}).items() if board is not None else ():
-                board.add_scalar(name, value, report.step)
+            if report.row and board is not None:
+                for name, value in report.row.items():
+                    board.add_scalar(name, value, report.step)
     except KeyboardInterrupt:
         return True
     finally:

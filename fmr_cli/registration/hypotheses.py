@@ -14,6 +14,7 @@ import numpy as np
 from fmr_cli.descriptors.consensus import consensus
 from fmr_cli.feature_metric.search import STARTS, search
 from fmr_cli.geometry.motion import Motion, rotations
+from fmr_cli.registration.options import Matrix
 from fmr_cli.registration.pair import CONSENSUS_TOLERANCE, Pair
 
 CONSENSUS_POSES = 5  # poses that matches agree on, at most
@@ -78,7 +79,7 @@ def by_chance(pair: Pair) -> list[Hypothesis]:
 
 
 def makers(
-    pair: Pair, init: str | np.ndarray, features: list[Hypothesis]
+    pair: Pair, init: str | Matrix | np.ndarray, features: list[Hypothesis]
 ) -> Iterator[tuple[str, Callable[[], list[Hypothesis]]]]:
     """The kinds of start that ``Options.init`` asks for, in order: (stage, function). features: what that kind gave."""
     name = init if isinstance(init, str) else "given"

@@ -131,6 +131,8 @@ def checked_pose(value: Any, scale: bool) -> Matrix:
 
     try:
         T = np.array(value, float)
+        if T.ndim == 0:
+            raise TypeError
     except (TypeError, ValueError):
         raise OptionsError(f"--init {value!r}: choose from {', '.join(STARTS)}, or give a 4x4 transform") from None
     if T.shape != (4, 4):
