@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -16,6 +15,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
+from fmr_cli.cores import usable_cores
 from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import align
@@ -25,7 +25,7 @@ from fmr_cli.synthetic.shapes import shapes
 Way = Callable[[np.ndarray, np.ndarray], np.ndarray]  # source (N, 3), target (M, 3) -> T_target_source
 
 PROTOCOLS = ("copy", "so3", "resample", "noise", "density", "overlap90", "overlap80", "overlap70")
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+CORES = usable_cores()
 console = Console(width=150, highlight=False)
 
 

@@ -15,3 +15,7 @@ class RegistrationError(FmrError):
 
 class ModelError(FmrError):
     """Weights that do not fit the architecture, or a device that is not there."""
+
+
+class OptionsError(FmrError):
+    """An option that is unknown, out of its range, or at odds with another one."""

@@ -1,43 +1,97 @@
-"""`fmr evaluate`: sets of clouds and methods in, each experiment's table as soon as it is there, files at the end."""
+"""`fmr evaluate`: the paper's experiments on the user's clouds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import typer
 from rich.console import Console
 
+from fmr_cli.cli.console import say, warn
 from fmr_cli.errors import FmrError
-from fmr_cli.evaluation.experiments import EXPERIMENTS, feature_maps, read_clouds, run
-from fmr_cli.evaluation.methods import Method, baselines, ours
-from fmr_cli.registration.models import Device, encoder, pick_device
-from fmr_cli.report import evaluation as report
 
-FEATURES = "features"
+if TYPE_CHECKING:
+    from fmr_cli.evaluation.experiments import Clouds, Row
+    from fmr_cli.evaluation.methods import Method
+    from fmr_cli.feature_metric.encoder import Encoder
+    from fmr_cli.registration.models import Device
+
+FEATURES = "features"  # the maps of the paper's Figure 7: plots alone, no table
 
 
-def evaluate(
-    scans: list[Path],
-    out: Path,
-    experiments: list[str],
-    models: list[Path],
-    with_baselines: bool,
-    count: int | None,
-    pairs: int,
-    points: int,
-    iterations: int,
-    plain: bool,
-    seed: int,
-    device: Device,
-    console: Console,
-    say: Callable[[str], None],
+def evaluate_command(
+    scans: Annotated[
+        list[Path], typer.Argument(help="Folders of scans or meshes; each is a set of its own.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="For results.csv and plots.")] = Path("evaluation"),
+    experiments: Annotated[
+        str, typer.Option(help="Comma-separated: rotation, density, noise, overlap, scenes, features.")
+    ] = "rotation,density,noise,overlap,scenes,features",
+    model: Annotated[
+        list[Path] | None,
+        typer.Option(help="Weights to evaluate; again for more.", show_default="the bundled ones"),
+    ] = None,
+    with_baselines: Annotated[
+        bool,
+        typer.Option("--baselines", help="PointNetLK, LM-ICP, small_gicp; FPFH + RANSAC, KISS-Matcher if installed."),
+    ] = False,
+    clouds: Annotated[int | None, typer.Option(help="Of each set, at most.", min=1, show_default="all")] = None,
+    pairs: Annotated[int, typer.Option(help="Random pairs at each level.", min=1)] = 100,
+    points: Annotated[int, typer.Option(help="Of each cloud.", min=16)] = 1024,
+    iterations: Annotated[int, typer.Option(help="Of the solver.", min=1)] = 10,
+    plain: Annotated[bool, typer.Option("--plain/--no-plain", help="The paper's plain least squares as well.")] = True,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same pairs.", min=0)] = 0,
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where the encoder runs.")] = "auto",
 ) -> None:
-    """Prints tables to the console, writes results.csv and PNGs to ``out``; ``say`` gets warnings. Raises FmrError."""
-    unknown = [name for name in experiments if name not in {*EXPERIMENTS, FEATURES}]
-    if unknown:
-        known = ", ".join([*EXPERIMENTS, FEATURES])
-        raise FmrError(f"--experiments {unknown[0]}: no such experiment; choose from {known}")
-    encoders = {str(path): encoder(path, device) for path in models} or {"bundled": encoder(None, device)}
+    """The paper's experiments on SCANS: errors by initial rotation, density, noise, overlap, as tables, CSV and plots.
+
+    The solver alone from the identity, without the search over starts and the polish of `fmr align`. Both clouds are
+    centred on their means; lengths are in units of the cloud (its largest extent about 1).
+    """
+    from fmr_cli.evaluation.experiments import read_clouds
+    from fmr_cli.registration.models import encoder, pick_device
+    from fmr_cli.report.evaluation import can_plot, write_csv
+
+    chosen = chosen_experiments(experiments)
+    encoders = {str(path): encoder(path, device) for path in model or []} or {"bundled": encoder(None, device)}
+    methods = chosen_methods(encoders, plain, with_baselines, iterations, device)
+    sets = [read_clouds(path, clouds, points, pick_device(device)) for path in scans]
+    warn(*(line for read in sets for line in read.skipped))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FmrError(f"{out}: cannot make this folder ({error.strerror}); give another --out") from None
+    plots = can_plot()
+    if not plots:
+        warn("no plots, matplotlib is not installed; pip install 'fmr-cli[eval]'")
+    rows: list[Row] = []
+    for name in chosen:
+        if name != FEATURES:
+            rows += run_experiment(name, sets, methods, pairs, points, seed, out if plots else None)
+            write_csv(out / "results.csv", rows)
+        elif plots:
+            plot_features(encoders, sets[0], points, seed, out)
+    say(f"written to {out}")
+
+
+def chosen_experiments(text: str) -> list[str]:
+    """The names in a comma-separated list. Raises FmrError for one that there is not."""
+    from fmr_cli.evaluation.experiments import EXPERIMENTS
+
+    names, known = [name.strip() for name in text.split(",")], [*EXPERIMENTS, FEATURES]
+    for name in names:
+        if name not in known:
+            raise FmrError(f"--experiments {name}: no such experiment; choose from {', '.join(known)}")
+    return names
+
+
+def chosen_methods(
+    encoders: dict[str, Encoder], plain: bool, with_baselines: bool, iterations: int, device: Device
+) -> dict[str, Method]:
+    """What is compared, by the name in the tables; says which baselines are not installed."""
+    from fmr_cli.evaluation.methods import baselines, ours
+
     methods: dict[str, Method] = {}
     for name, weights in encoders.items():
         methods[name] = ours(weights, iterations, True)
@@ -46,31 +100,29 @@ def evaluate(
     if with_baselines:
         others, missing = baselines(device, iterations)
         methods |= others
-        for line in missing:
-            say(f"warning: {line}")
-    sets = [read_clouds(path, count, points, pick_device(device)) for path in scans]
-    for clouds in sets:
-        for line in clouds.skipped:
-            say(f"warning: {line}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FmrError(f"{out}: cannot make this folder ({error.strerror}); give another --out") from None
-    plots = report.can_plot()
-    if not plots:
-        say("warning: no plots, matplotlib is not installed; pip install 'fmr-cli[eval]'")
-    rows = []
-    for name in experiments:
-        if name == FEATURES:
-            if plots:
-                for label, weights in encoders.items():
-                    path = out / f"features_{Path(label).stem}.png"
-                    report.plot_maps(path, feature_maps(weights, sets[0], points, seed))
-            continue
-        own = [row for clouds in sets for row in run(EXPERIMENTS[name], clouds, methods, pairs, points, seed)]
-        console.print(report.table(EXPERIMENTS[name], own))
-        rows += own
-        report.write_csv(out / "results.csv", rows)
-        if plots and len(EXPERIMENTS[name].levels) > 1:
-            report.plot(out / f"{name}.png", EXPERIMENTS[name], own)
-    say(f"written to {out}")
+        warn(*missing)
+    return methods
+
+
+def run_experiment(
+    name: str, sets: list[Clouds], methods: dict[str, Method], pairs: int, points: int, seed: int, plots: Path | None
+) -> list[Row]:
+    """One experiment on all sets: its table printed, its plot in the folder ``plots``, its rows given back."""
+    from fmr_cli.evaluation.experiments import EXPERIMENTS, run
+    from fmr_cli.report.evaluation import plot, table
+
+    experiment = EXPERIMENTS[name]
+    rows = [row for clouds in sets for row in run(experiment, clouds, methods, pairs, points, seed)]
+    Console(highlight=False).print(table(experiment, rows))
+    if plots and len(experiment.levels) > 1:
+        plot(plots / f"{name}.png", experiment, rows)
+    return rows
+
+
+def plot_features(encoders: dict[str, Encoder], clouds: Clouds, points: int, seed: int, out: Path) -> None:
+    """The feature maps of every encoder, a PNG each."""
+    from fmr_cli.evaluation.experiments import feature_maps
+    from fmr_cli.report.evaluation import plot_maps
+
+    for label, weights in encoders.items():
+        plot_maps(out / f"features_{Path(label).stem}.png", feature_maps(weights, clouds, points, seed))

@@ -1,64 +1,60 @@
-"""The registration options of the command line, declared once for every command that registers."""
+"""Options that several commands share; those of a registration are made from the fields of ``Options``."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from dataclasses import Field, fields
+from inspect import Parameter
+from typing import Annotated, Any
 
 import typer
 
-from fmr_cli.registration.options import STARTS, read_init
+from fmr_cli.registration.options import Options, flag, read_init
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+Verbose = Annotated[
+    int, typer.Option("--verbose", "-v", count=True, help="Say what was decided and why; -vv says more.")
+]
+Debug = Annotated[bool, typer.Option("--debug", help="Where an error comes from, as a traceback.")]
 
 
-def option(help: str, *names: str, panel: str = "Registration", **kwargs: Any) -> Any:
-    return typer.Option(*names, help=help, rich_help_panel=panel, **kwargs)
-
-
-def registration_options(
-    init: Annotated[str, option(f"Where to start: {', '.join(STARTS)}, or a transform file.")] = "auto",
-    voxel_size: Annotated[float | None, option("Working voxel edge. [default: from the data]", min=0.0)] = None,
-    normalize: Annotated[bool, option("Scale the clouds to the encoder's unit box.")] = True,
-    points: Annotated[int, option("Points that the global encoder sees.", min=10)] = 1024,
-    dof: Annotated[
-        Literal["rigid", "yaw", "translation", "planar"],
-        option("What may move; yaw: a rotation about --up and any shift, planar: none along it."),
-    ] = "rigid",
-    up: Annotated[tuple[float, float, float], option("The vertical, for yaw and planar.")] = (0.0, 0.0, 1.0),
-    scale: Annotated[bool, option("Also estimate one scale factor.", "--scale")] = False,
-    max_angle: Annotated[float | None, option("No rotation beyond it, in degrees.", min=0.0)] = None,
-    max_shift: Annotated[float | None, option("No shift of the source's centre beyond it.", min=0.0)] = None,
-    iterations: Annotated[int, option("Iterations of the solver, at most.", min=1)] = 10,
-    robust: Annotated[bool, option("Robust steps on both clouds' Jacobians, or the paper's plain ones.")] = True,
-    refine: Annotated[bool, option("Finish with a geometric polish.")] = True,
-    model: Annotated[Path | None, option("Encoder weights, .safetensors. [default: the bundled ones]")] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"], option("Where the solver runs; auto: the CPU.")] = "auto",
-    seed: Annotated[int, option("The same seed gives the same answer.", min=0)] = 0,
-) -> dict[str, Any]:
-    """What ``fmr_cli.Options`` takes; a transform file for ``init`` is read. Raises FmrError.
-
-    As a dict, since Options comes with scipy, which should not come before the first look at the files.
-    """
-    return {
-        "init": read_init(init), "voxel_size": voxel_size, "normalize": normalize, "points": points, "dof": dof,
-        "up": up, "scale": scale, "max_angle": max_angle, "max_shift": max_shift, "iterations": iterations,
-        "robust": robust, "refine": refine, "model": model, "device": device, "seed": seed,
-    }  # fmt: skip
+def registration_parameter(f: Field) -> Parameter:
+    """A field of Options as a parameter of a command. Options checks its value, so that every message is one line."""
+    text = f.metadata["help"]
+    names = [flag(f.name)] if f.default is False else []  # what is off by default needs no --no-
+    info = typer.Option(*names, help=f"{text[0].upper()}{text[1:]}.", rich_help_panel="Registration")
+    kind = str if f.name == "init" else f.type  # a name or a file, see read_init
+    return Parameter(f.name, Parameter.KEYWORD_ONLY, default=f.default, annotation=Annotated[kind, info])
 
 
 def takes_registration_options(command: Callable) -> Callable:
-    """Gives a command every option of ``registration_options``; they come to it as one argument, ``options``."""
-    shared, own = (inspect.signature(function, eval_str=True) for function in (registration_options, command))
+    """Gives a command every option of a registration; they come to it as one argument, ``options``."""
+    names = [f.name for f in fields(Options)]
 
-    @functools.wraps(command)
     def run(**given: Any) -> None:
-        options = registration_options(**{name: given.pop(name) for name in shared.parameters})
-        command(**given, options=options)
+        chosen = {name: given.pop(name) for name in names}
+        command(**given, options=Options(**chosen | {"init": read_init(chosen["init"])}))
 
-    parameters = [p for p in own.parameters.values() if p.name != "options"]
-    keyword_only = [p.replace(kind=p.KEYWORD_ONLY) for p in shared.parameters.values()]
-    run.__signature__ = own.replace(parameters=[*parameters, *keyword_only])  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in [*parameters, *keyword_only]}
+    return with_parameters(command, run, [registration_parameter(f) for f in fields(Options)], without="options")
+
+
+def takes_debug(command: Callable) -> Callable:
+    """Gives a command --debug, which ``main`` looks for by itself."""
+
+    def run(**given: Any) -> None:
+        del given["debug"]
+        command(**given)
+
+    return with_parameters(command, run, [Parameter("debug", Parameter.KEYWORD_ONLY, default=False, annotation=Debug)])
+
+
+def with_parameters(command: Callable, run: Callable, more: list[Parameter], without: str = "") -> Callable:
+    """``run`` in the place of ``command``, with its name, its text and its parameters, some more and one less."""
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [*(p for p in signature.parameters.values() if p.name != without), *more]
+    run = functools.wraps(command)(run)
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run

@@ -1,4 +1,4 @@
-"""`fmr train` as a person sees it: one live line, a table that grows by an epoch, and the verdict."""
+"""A training run as a person sees it: a line a step, a line an epoch, a table and the verdict at the end."""
 
 from __future__ import annotations
 
@@ -6,70 +6,9 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from fmr_cli.registration.models import Device
 from fmr_cli.training.loop import MODEL, Report, Trainer, success_table
-from fmr_cli.training.recipe import Recipe
-from fmr_cli.training.run import prepare, write_card
-
-
-def train(
-    scans: list[Path],
-    recipe: Recipe,
-    out: Path,
-    console: Console,
-    *,
-    pairs: Path | None,
-    minutes: float | None,
-    resume: bool,
-    device: Device,
-    quiet: bool,
-) -> None:
-    """Runs to the end, to the minutes' end or to Ctrl-C, and says what came of it. Raises FmrError."""
-    live = not quiet and console.is_terminal
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[said]}"))
-    with Progress(*columns, console=console, disable=not live) as bar:
-        task = bar.add_task("reading", total=None, said="")
-
-        def reading(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total, said=f"{done} of {total} scans")
-
-        trainer, warnings = prepare(
-            scans, recipe, out, pairs=pairs, minutes=minutes, resume=resume, device=device, progress=reading
-        )
-        quiet = quiet or trainer.rank > 0
-        if not quiet:
-            for warning in warnings:
-                console.print(f"warning: {warning}", markup=False)
-            console.print(f"learning from {'; '.join(trainer.data.described)}", markup=False)
-        board = tensorboard(out) if trainer.rank == 0 else None
-        stopped = False
-        try:
-            bar.update(task, description="registering", total=None, said="the held-out clouds, before training")
-            for report in trainer.run():
-                bar.update(task, description="training", completed=report.step, total=report.steps, said=line(report))
-                if report.row and not quiet:
-                    console.print(epoch_line(report.row), markup=False)
-                if report.row and board is not None:
-                    for name, value in report.row.items():
-                        board.add_scalar(name, value, report.step)
-        except KeyboardInterrupt:
-            stopped = True
-        finally:
-            if board is not None:
-                board.close()
-            if trainer.rank == 0 and trainer.progress.scores:
-                write_card(trainer)
-    if quiet:
-        return
-    if not trainer.progress.scores:
-        console.print("stopped before the first test: nothing was written")
-        return
-    console.print(table(trainer))
-    console.print(verdict(trainer, stopped), markup=False)
 
 
 def line(report: Report) -> str:

@@ -11,9 +11,8 @@ import json
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TextIO
@@ -373,29 +372,6 @@ class Sequence:
     def uncertain(self) -> list[dict[str, Any]]:
         """The rows of the frames that are not to be trusted."""
         return [row for row in self.rows if row["status"] != "aligned"]
-
-
-@contextmanager
-def live(console: Any, done: int, total: int, shown: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A line on a terminal that says how far a run is; yields the function that takes each new row."""
-    if not shown:
-        yield lambda row: None
-        return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    begin, length = time.perf_counter(), 0.0
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("starting", total=total, completed=done)
-
-        def show(row: dict[str, Any]) -> None:
-            nonlocal length
-            length += row["motion"]
-            rate = (row["frame"] + 1 - done) / (time.perf_counter() - begin)
-            said = f"{rate:.1f} frames/s, {row['status']}, path {length:.4g}"
-            progress.update(task, advance=1, description=said)
-
-        yield show
 
 
 def csv_line(cells: list[Any]) -> str:

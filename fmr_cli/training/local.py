@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from fmr_cli.cores import usable_cores
 from fmr_cli.descriptors.patch_encoder import CHANNELS, NEIGHBOURS, PATCH_RADIUS, describe_patches
 from fmr_cli.geometry.sampling import working_scale
 from fmr_cli.geometry.surface import Surface
@@ -143,7 +144,7 @@ def main(out: str, pairs: int = 480, steps: int = 2400, seed: int = 0) -> None:
     """``python -m fmr_cli.training.local models/local.safetensors``: the bundled local encoder, from code alone."""
     from safetensors.torch import save_file
 
-    material = make_material(pairs, seed, workers=multiprocessing.cpu_count())
+    material = make_material(pairs, seed, workers=usable_cores())
     torch.set_num_threads(1)
     model = train(material, steps, seed)
     save_file(model.state_dict(), out)

@@ -1,0 +1,53 @@
+"""`fmr batch`: many pairs from a manifest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fmr_cli.cli.console import UNCERTAIN, progress, quick_imports, say, show_log
+from fmr_cli.cli.options import Quiet, Verbose, takes_registration_options
+from fmr_cli.cores import usable_cores
+from fmr_cli.registration.options import Options
+
+
+@takes_registration_options
+def batch_command(
+    manifest: Annotated[
+        Path,
+        typer.Argument(help="CSV: source, target and optionally init, name; paths relative to it.", show_default=False),
+    ],
+    options: Options,
+    out: Annotated[Path, typer.Option(help="The folder for results.csv and transforms/.", show_default=False)],
+    aligned: Annotated[bool, typer.Option("--aligned", help="Write each moved source to aligned/.")] = False,
+    merged: Annotated[bool, typer.Option("--merged", help="Write both clouds of each pair to merged/.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where a stopped run has left off.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Pairs at a time; one a core if not given.", show_default=False)
+    ] = None,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Register the pairs of a MANIFEST, each file read once."""
+    from collections import Counter
+
+    show_log(verbose)
+    with quick_imports():
+        from fmr_cli.batch.run import Batch
+
+    batch = Batch(manifest, out, options, aligned=aligned, merged=merged)
+    done = batch.open(resume)
+    count = Counter(row["status"] for row in done)
+    with progress(quiet) as bar:
+        task = bar.add_task("registering", total=len(batch.pairs), completed=len(done), said="")
+        for row in batch.run(len(done), workers or usable_cores()):
+            count[row["status"]] += 1
+            bar.advance(task)
+            if row["status"] == "failed":
+                say(f"{row['source']} onto {row['target']} failed: {row['message']}", quiet=quiet)
+    said = ", ".join(f"{count[status]} {status}" for status in ("aligned", "uncertain", "failed"))
+    say(f"{said}: {out / 'results.csv'}", quiet=quiet)
+    if count["uncertain"] + count["failed"]:
+        raise typer.Exit(UNCERTAIN)

@@ -1,0 +1,89 @@
+"""The options of a registration on the command line: those of ``Options``, in the README too, refused on one line."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import Field, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmr_cli.cli.options import takes_registration_options
+from fmr_cli.registration.options import Options, choices, flag
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+def test_the_defaults_are_the_librarys():
+    given = []
+
+    @takes_registration_options
+    def command(options: Options) -> None:
+        given.append(options)
+
+    command(**{f.name: f.default for f in fields(Options)})
+    assert given == [Options()]
+
+
+def test_every_option_arrives(fmr_here, monkeypatch):
+    from fmr_cli.registration import pipeline
+
+    class SeenError(Exception):
+        pass
+
+    def align(source, target, options):
+        raise SeenError(options)
+
+    monkeypatch.setattr(pipeline, "align", align)
+    with pytest.raises(SeenError) as seen:
+        fmr_here(
+            "align", "scan_a.ply", "scan_b.ply", "--init", "search", "--voxel-size", 0.5, "--no-normalize",
+            "--points", 99, "--dof", "yaw", "--up", 0, 1, 0, "--scale", "--max-angle", 5, "--max-shift", 6,
+            "--iterations", 7, "--no-robust", "--no-refine", "--model", "m.safetensors", "--device", "cpu", "--seed", 8,
+        )  # fmt: skip
+    assert seen.value.args[0] == Options(
+        init="search", voxel_size=0.5, normalize=False, points=99, dof="yaw", up=(0, 1, 0), scale=True, max_angle=5,
+        max_shift=6, iterations=7, robust=False, refine=False, model=Path("m.safetensors"), device="cpu", seed=8,
+    )  # fmt: skip
+    changed = [f.name for f in fields(Options) if getattr(seen.value.args[0], f.name) != f.default]
+    assert changed == [f.name for f in fields(Options)], "an option is missing above"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--voxel-size", 0), "fmr: --voxel-size 0.0: is too small, give more than 0"),
+        (("--voxel-size", "nan"), "fmr: --voxel-size nan: is no finite number"),
+        (("--points", 9), "fmr: --points 9: is too small, give 10 or more"),
+        (("--up", 0, 0, 0), "fmr: --up (0.0, 0.0, 0.0): is no direction; give three finite numbers, not all zero"),
+        (("--init", "feature"), "fmr: feature: is no start (auto, search, features, centroid, identity) and no "),
+        (("--init", "twice.txt"), "fmr: --init: its transform scales by 2; add --scale, or give a rigid motion"),
+    ],
+)
+def test_a_wrong_value_is_one_line(fmr_here, tmp_path, arguments, said):
+    np.savetxt(tmp_path / "twice.txt", np.diag([2.0, 2.0, 2.0, 1.0]))
+    done = fmr_here("align", "a.ply", "b.ply", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith(said)
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("name", "known"), [("dof", "planar"), ("device", "cuda")])
+def test_an_unknown_word_names_the_choices(fmr_here, name, known):
+    done = fmr_here("align", "a.ply", "b.ply", f"--{name}", "other")
+    assert done.returncode == 2
+    assert known in done.stderr
+
+
+def readme_row(f: Field) -> str:
+    """The option's line in the README's table."""
+    name = flag(f.name) + (f"/--no-{f.name}" if f.default is True else "")
+    name += {"init": " auto", "up": " X Y Z"}.get(f.name, "")
+    words = "|".join(["--[a-z-]+", *(rf"(?<![\w-]){word}(?![\w-])" for word in choices(f))])
+    return f"| `{name}` | {re.sub(words, lambda found: f'`{found[0]}`', f.metadata['help'])} |"
+
+
+def test_the_readme_lists_them():
+    table = "\n".join(map(readme_row, fields(Options)))
+    assert table in README.read_text("utf-8"), f"put this table into README.md:\n{table}"
