@@ -1,0 +1,143 @@
+"""A pair of scans before it is moved and made noisy, and what its makers have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.voxels import voxel_downsample
+from fmr_cli.synthetic import sensors
+from fmr_cli.synthetic.sensors import CELLS, DIFFERENT, Scan
+from fmr_cli.synthetic.structures import Structure
+
+SENSORS = ("surface", "terrestrial", "lidar", "camera")
+ENOUGH = 12  # cells (1 / CELLS of a scan's size) that a detail covers in both scans, at least
+SHARED = 0.3  # of the source that an alias has to lay on the target to be worth listing
+
+
+class Redraw(Exception):  # noqa: N818 - not an error: the draw has missed what its kind promises
+    """Draw again: this draw does not keep what its kind promises."""
+
+
+@dataclass
+class Draft:
+    """source, target: scans in one scene's frame, so that the identity is the right pose, if any is.
+
+    aliases: all motions of the scene's frame that lay the source on the target equally well; empty if none does.
+    flat: 2-D scans, which may only be turned in their plane. noise: standard deviation as a share of the size at most,
+    None for the usual.
+    """
+
+    source: Scan
+    target: Scan
+    aliases: list[np.ndarray]
+    unique: bool
+    flat: bool = False
+    noise: float | None = None
+
+
+def once() -> list[np.ndarray]:
+    """The aliases of a pair with one right pose."""
+    return [np.eye(4)]
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def look(
+    structure: Structure,
+    sensor: str,
+    rng: np.random.Generator,
+    stand: np.ndarray,
+    towards: np.ndarray,
+    reach: float,
+    density: float,
+    facing: bool = True,
+) -> Scan:
+    """One scan of a structure by one of SENSORS from ``stand`` (3,), a camera looking along ``towards`` (3,).
+
+    facing: whether an even scan shows only what faces the stand, or all there is.
+    """
+    scene = structure.scene
+    if sensor == "surface":
+        return sensors.surface_scan(scene, rng, density, stand if facing else None, structure.shells)
+    if sensor == "terrestrial":
+        return sensors.terrestrial_scan(scene, rng, stand, reach, int(rng.integers(160, 300)))
+    if sensor == "lidar":
+        return sensors.lidar_scan(scene, rng, stand, reach, int(rng.choice([32, 64])), int(rng.integers(360, 720)))
+    return sensors.camera_scan(scene, rng, stand, towards, reach, int(rng.integers(4, 7)), wander=0.7)
+
+
+def check_points(*scans: Scan, least: int = 800) -> None:
+    """Raises Redraw where a scan has hardly seen the scene."""
+    if min(len(scan.points) for scan in scans) < least:
+        raise Redraw
+
+
+def aliases(structure: Structure, source: Scan, target: Scan) -> list[np.ndarray]:
+    """The structure's symmetries that lay enough of the source on the target, the identity first."""
+    size = min(source.size, target.size)
+    cells = voxel_downsample(source.points, size / CELLS)
+    probes = cells[:: max(len(cells) // 200, 1)]
+    tree = cKDTree(target.points)
+    shares = np.array(
+        [
+            np.isfinite(tree.query(transform_points(S, probes), distance_upper_bound=1.5 * size / CELLS)[0]).mean()
+            for S in structure.symmetries
+        ]
+    )
+    kept = [S for S, share in zip(structure.symmetries, shares, strict=True) if share >= min(SHARED, shares[0])]
+    return [S @ turn for S in kept for turn in structure.turns]
+
+
+def on_details(structure: Structure, points: np.ndarray) -> np.ndarray:
+    """Which points (N, 3) belong to the details."""
+    found = np.zeros(len(points), bool)
+    for i in structure.details:
+        found |= sensors.inside(structure.scene.maps[i], structure.scene.kinds[i], points, 0.02)
+    return found
+
+
+def check_unique(structure: Structure, source: Scan, target: Scan) -> None:
+    """Raises Redraw unless a detail shows in both scans that no symmetry of the structure lays on anything."""
+    size = min(source.size, target.size)
+    for one, other, way in ((source, target, 1), (target, source, -1)):
+        tree = cKDTree(other.points)
+        cells = one.points[on_details(structure, one.points)]
+        cells = voxel_downsample(cells, size / CELLS) if len(cells) else cells
+        common = cells[tree.query(cells)[0] < 1.5 * size / CELLS] if len(cells) else cells
+        if len(common) < ENOUGH:
+            raise Redraw
+        for S in structure.symmetries:
+            for turn in structure.turns[::20]:  # a body of revolution: every 60 deg
+                T = S @ turn
+                if np.allclose(T, np.eye(4)):
+                    continue
+                gap = tree.query(transform_points(T if way > 0 else np.linalg.inv(T), common))[0]
+                if (gap > DIFFERENT * size).sum() < 0.8 * ENOUGH:
+                    raise Redraw
+
+
+def several(structure: Structure, source: Scan, target: Scan) -> Draft:
+    """A pair that fits in several ways. Raises Redraw where the scans share too little for a second one."""
+    found = aliases(structure, source, target)
+    if len(found) < 2:
+        raise Redraw
+    return Draft(source, target, found, unique=False)
+
+
+def unique(structure: Structure, source: Scan, target: Scan) -> Draft:
+    """A pair that fits in one way, because of the structure's details."""
+    check_unique(structure, source, target)
+    return Draft(source, target, once(), unique=True)
+
+
+def swapped(pair: Sequence[Scan], rng: np.random.Generator) -> tuple[Scan, Scan]:
+    """Either scan may be the source."""
+    first, second = pair
+    return (first, second) if rng.random() < 0.5 else (second, first)
