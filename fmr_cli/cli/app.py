@@ -187,9 +187,9 @@ def sequence_command(
 ) -> None:
     """Register every scan of a sequence into the frame of the first."""
     from fmr_cli import io
+    from fmr_cli.cli.live import live
     from fmr_cli.io import outputs
-    from fmr_cli.sequence.run import Sequence, live
-    from fmr_cli.sequence.scans import find_scans
+    from fmr_cli.sequence import SequenceOptions, align_sequence, find_scans
 
     outputs.check_outputs([(out, (out.suffix.lower(),)), (residuals, (".csv",)), (merged, io.WRITABLE)])
     found = find_scans(scans, start, stop, step, [path for path in (out, residuals, merged) if path])
@@ -199,31 +199,29 @@ def sequence_command(
         from fmr_cli.evaluation import trajectory as trajectory_eval
 
         true = trajectory_eval.read_truth(truth, found.chosen, found.total)
-    sequence = Sequence(
-        found, out, form=form, camera_frame=camera_frame, residuals=residuals, merged=merged,
-        merged_voxel=merged_voxel or None, voxel_size=voxel_size or None, loop_closure=loop_closure,
-        deskew=deskew,
+    options = SequenceOptions(
+        format=form, camera_frame=camera_frame, voxel_size=voxel_size or None, merged_voxel=merged_voxel or None,
+        loop_closure=loop_closure, deskew=deskew,
     )  # fmt: skip
-    done = sequence.open(resume)
-    with live(err, done, len(found.files), err.is_terminal and not quiet) as show:
-        for row in sequence.run():
-            show(row)
+    with live(err, err.is_terminal and not quiet) as show:
+
+        def on_row(row: dict[str, Any], done: int, total: int) -> None:
+            show(row, done, total)
             if "message" in row and not quiet:
                 say(f"frame {row['frame']} is bridged: {row['message']}")
-    for line in [] if quiet else sequence.summary():
+
+        result = align_sequence(
+            found, out, options, residuals=residuals, merged=merged, resume=resume, on_row=on_row
+        )  # fmt: skip
+    for line in [] if quiet else result.summary():
         say(line)
     if truth:
-        poses = sequence.trajectory()
-        errors = trajectory_eval.evaluate(poses, true)
+        errors = trajectory_eval.evaluate(result.poses, true)
         outputs.write_json(out.with_suffix(".evaluation.json"), errors)
-        trajectory_eval.plot(out.with_suffix(".png"), poses, true)
+        trajectory_eval.plot(out.with_suffix(".png"), result.poses, true)
         for line in [] if quiet else trajectory_eval.summary(errors):
             say(line)
-    if sequence.uncertain:
-        if not quiet:
-            names = ", ".join(f"{row['frame']} ({row['file']})" for row in sequence.uncertain[:20])
-            more = len(sequence.uncertain) - 20
-            say(f"{len(sequence.uncertain)} uncertain, look at: {names}{f' and {more} more' if more > 0 else ''}")
+    if result.status != "aligned":
         raise typer.Exit(UNCERTAIN)
 
 
