@@ -121,12 +121,9 @@ def batch_command(
     )
 
     with quick_imports():
-        from fmr_cli.batch.run import Batch
-        from fmr_cli.registration.options import Options
+        from fmr_cli.batch import align_batch
+        from fmr_cli.registration import Options
 
-    batch = Batch(manifest, out, Options(**options), aligned=aligned, merged=merged)
-    done = batch.open(resume)
-    count = Counter(row["status"] for row in done)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -135,17 +132,22 @@ def batch_command(
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=err, disable=quiet or not err.is_terminal) as progress:
-        task = progress.add_task("registering", total=len(batch.pairs), completed=len(done))
-        for row in batch.run(len(done), workers or len(os.sched_getaffinity(0))):
-            count[row["status"]] += 1
-            progress.advance(task)
+        task = progress.add_task("registering", total=None)
+
+        def on_row(row: dict[str, Any], done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
             if row["status"] == "failed" and not quiet:
                 say(f"{row['source']} onto {row['target']} failed: {row['message']}")
-    bad = count["uncertain"] + count["failed"]
+
+        rows = align_batch(
+            manifest, out, Options(**options), aligned=aligned, merged=merged, resume=resume, workers=workers,
+            on_row=on_row,
+        )  # fmt: skip
+    count = Counter(row["status"] for row in rows)
     if not quiet:
         said = ", ".join(f"{count[status]} {status}" for status in ("aligned", "uncertain", "failed"))
         say(f"{said}: {out / 'results.csv'}")
-    if bad:
+    if count["uncertain"] or count["failed"]:
         raise typer.Exit(UNCERTAIN)
 
 
