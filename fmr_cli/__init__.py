@@ -22,6 +22,11 @@ _HOME = {
     "align": "fmr_cli.registration",
     "Registration": "fmr_cli.registration",
     "Options": "fmr_cli.registration",
+    "align_batch": "fmr_cli.batch",
+    "align_sequence": "fmr_cli.sequence",
+    "align_batch": "fmr_cli.batch",
+    "align_sequence": "fmr_cli.sequence",
+    "SequenceOptions": "fmr_cli.sequence",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from fmr_cli.cli.console import UNCERTAIN, progress, quick_imports, say, show_log
 from fmr_cli.cli.options import Quiet, Verbose, takes_registration_options
-from fmr_cli.cores import usable_cores
 from fmr_cli.registration.options import Options
 
 
@@ -35,18 +34,20 @@ def batch_command(
 
     show_log(verbose)
     with quick_imports():
-        from fmr_cli.batch.run import Batch
+        from fmr_cli.batch import align_batch
 
-    batch = Batch(manifest, out, options, aligned=aligned, merged=merged)
-    done = batch.open(resume)
-    count = Counter(row["status"] for row in done)
     with progress(quiet) as bar:
-        task = bar.add_task("registering", total=len(batch.pairs), completed=len(done), said="")
-        for row in batch.run(len(done), workers or usable_cores()):
-            count[row["status"]] += 1
-            bar.advance(task)
+        task = bar.add_task("registering", total=None, said="")
+
+        def on_row(row: dict[str, Any], done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
             if row["status"] == "failed":
                 say(f"{row['source']} onto {row['target']} failed: {row['message']}", quiet=quiet)
+
+        rows = align_batch(
+            manifest, out, options, aligned=aligned, merged=merged, resume=resume, workers=workers, on_row=on_row
+        )
+    count = Counter(row["status"] for row in rows)
     said = ", ".join(f"{count[status]} {status}" for status in ("aligned", "uncertain", "failed"))
     say(f"{said}: {out / 'results.csv'}", quiet=quiet)
     if count["uncertain"] + count["failed"]:

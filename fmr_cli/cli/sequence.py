@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,10 +14,7 @@ from fmr_cli.cli.options import Quiet, Verbose
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from fmr_cli.sequence.run import Sequence
-
-NAMED = 20  # uncertain frames that are named at the end, at most
+    from rich.progress import Progress
 
 
 def sequence_command(
@@ -58,25 +56,24 @@ def sequence_command(
     """Register every scan of a sequence into the frame of the first."""
     from fmr_cli import io
     from fmr_cli.io import outputs
-    from fmr_cli.sequence.run import Sequence
-    from fmr_cli.sequence.scans import find_scans
+    from fmr_cli.sequence import SequenceOptions, align_sequence, find_scans
 
     show_log(verbose)
     outputs.check_outputs([(out, (out.suffix.lower(),)), (residuals, (".csv",)), (merged, io.WRITABLE)])
     found = find_scans(scans, start, stop, step, [path for path in (out, residuals, merged) if path])
     say(*found.notes, quiet=quiet)
     true = read_truth(truth, found) if truth else None
-    sequence = Sequence(
-        found, out, form=form, camera_frame=camera_frame, residuals=residuals, merged=merged,
-        merged_voxel=merged_voxel or None, voxel_size=voxel_size or None, loop_closure=loop_closure,
-        deskew=deskew,
+    options = SequenceOptions(
+        format=form, camera_frame=camera_frame, voxel_size=voxel_size or None, merged_voxel=merged_voxel or None,
+        loop_closure=loop_closure, deskew=deskew,
     )  # fmt: skip
-    follow(sequence, resume, quiet)
-    say(*sequence.summary(), quiet=quiet)
+    with progress(quiet) as bar:
+        on_row = follow(bar, quiet)
+        result = align_sequence(found, out, options, residuals=residuals, merged=merged, resume=resume, on_row=on_row)
+    say(*result.summary(), quiet=quiet)
     if true is not None:
-        compare(sequence.trajectory(), true, out, quiet)
-    if sequence.uncertain:
-        say(look_at(sequence.uncertain), quiet=quiet)
+        compare(result.poses, true, out, quiet)
+    if result.status != "aligned":
         raise typer.Exit(UNCERTAIN)
 
 
@@ -87,18 +84,21 @@ def read_truth(path: Path, found: Any) -> np.ndarray:
     return trajectory.read_truth(path, found.chosen, found.total)
 
 
-def follow(sequence: Sequence, resume: bool, quiet: bool) -> None:
-    """The run from its first frame, or where an earlier one has left off, to the last."""
-    done = sequence.open(resume)
-    begin, length = time.perf_counter(), 0.0
-    with progress(quiet) as bar:
-        task = bar.add_task("registering", total=len(sequence.scans.files), completed=done, said="")
-        for row in sequence.run():
-            length += row["motion"]
-            rate = (row["frame"] + 1 - done) / (time.perf_counter() - begin)
-            bar.update(task, advance=1, said=f"{rate:.1f} frames/s, {row['status']}, path {length:.4g}")
-            if "message" in row:
-                say(f"frame {row['frame']} is bridged: {row['message']}", quiet=quiet)
+def follow(bar: Progress, quiet: bool) -> Callable[[dict[str, Any], int, int], None]:
+    """The function that takes each new row, how many rows there are, and of how many: it moves the bar on."""
+    begin, length, seen = time.perf_counter(), 0.0, 0
+    task = bar.add_task("registering", total=None, said="")
+
+    def on_row(row: dict[str, Any], done: int, total: int) -> None:
+        nonlocal length, seen
+        length, seen = length + row["motion"], seen + 1
+        rate = seen / (time.perf_counter() - begin)
+        said = f"{rate:.1f} frames/s, {row['status']}, path {length:.4g}"
+        bar.update(task, total=total, completed=done, said=said)
+        if "message" in row:
+            say(f"frame {row['frame']} is bridged: {row['message']}", quiet=quiet)
+
+    return on_row
 
 
 def compare(poses: np.ndarray, true: np.ndarray, out: Path, quiet: bool) -> None:
@@ -110,10 +110,3 @@ def compare(poses: np.ndarray, true: np.ndarray, out: Path, quiet: bool) -> None
     outputs.write_json(out.with_suffix(".evaluation.json"), errors)
     trajectory.plot(out.with_suffix(".png"), poses, true)
     say(*trajectory.summary(errors), quiet=quiet)
-
-
-def look_at(uncertain: list[dict[str, Any]]) -> str:
-    """Which frames a person should look at."""
-    names = ", ".join(f"{row['frame']} ({row['file']})" for row in uncertain[:NAMED])
-    more = len(uncertain) - NAMED
-    return f"{len(uncertain)} uncertain, look at: {names}{f' and {more} more' if more > 0 else ''}"

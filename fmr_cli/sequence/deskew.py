@@ -29,19 +29,19 @@ def scan_times(cloud: PointCloud) -> np.ndarray:
     return np.where(finite, since / last, 0.5)
 
 
-def deskew(points: np.ndarray, times: np.ndarray, motion: np.ndarray) -> np.ndarray:
+def deskew(points: np.ndarray, times: np.ndarray, T_begin_end: np.ndarray) -> np.ndarray:
     """Points as the scanner would have seen them had it stood where it was in the middle of the scan.
 
     points: (N, 3), file units, each in the sensor's frame of its own moment; times: (N,), 0 to 1 over the scan;
-    motion: (4, 4), the sensor's frame at 1 to that at 0. Returns (N, 3), file units, in the frame at 0.5.
+    T_begin_end: (4, 4), the sensor's frame at 1 to that at 0. Returns (N, 3), file units, in the frame at 0.5.
     With the motion's constant turn w and velocity v, and u = time - 0.5: x -> exp(u w) x + u v + u^2 / 2 w x v, where
     v + w x v / 2 is the motion's shift (the arc to second order). The middle is also what the pose of an untouched
     scan refers to on average.
     """
     from scipy.spatial.transform import Rotation
 
-    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-    velocity = np.linalg.solve(np.eye(3) + np.cross(turn, np.eye(3)).T / 2, motion[:3, 3])
+    turn = Rotation.from_matrix(T_begin_end[:3, :3]).as_rotvec()
+    velocity = np.linalg.solve(np.eye(3) + np.cross(turn, np.eye(3)).T / 2, T_begin_end[:3, 3])
     u = (times - 0.5)[:, None]
     shift = u * velocity + u**2 / 2 * np.cross(turn, velocity)
     return Rotation.from_rotvec(u * turn).apply(points) + shift

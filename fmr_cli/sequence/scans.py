@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fmr_cli.errors import CloudFileError
-from fmr_cli.io import SUFFIXES
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import CloudFileError, FmrError
+from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.io.files import check_readable
 from fmr_cli.io.transforms import as_transform, number_rows
 
@@ -20,17 +21,56 @@ TEXT = {".txt", ".csv"}  # beside scans of another format these are poses, times
 
 @dataclass(frozen=True)
 class Scans:
-    """files: in order; ``chosen`` are their places among all ``total``. times: one a file, seconds, or None.
+    """The scans of a sequence, in order.
 
-    T_camera_scan: (4, 4), calib.txt's Tr, or None. notes: what a person should know about the choice, a line each.
+    sources: files, or clouds in memory; ``chosen`` are their places among all ``total``. times: (n,), one a scan,
+    seconds, or None. T_camera_scan: (4, 4), calib.txt's Tr, or None. notes: what a person should know about the choice,
+    a line each.
     """
 
-    files: list[Path]
+    sources: list[Path | PointCloud]
     chosen: range
     total: int
-    times: np.ndarray | None
-    T_camera_scan: np.ndarray | None
+    times: np.ndarray | None = None
+    T_camera_scan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def name(self, index: int) -> str:
+        """The scan's file name, for tables."""
+        path = self.path(index)
+        return path.name if path else f"scan {self.chosen[index]}"
+
+    def path(self, index: int) -> Path | None:
+        """The scan's file, where it has one."""
+        source = self.sources[index]
+        return source.path if isinstance(source, PointCloud) else source
+
+    def read(self, index: int, *, attributes: bool) -> PointCloud:
+        """One scan. Raises CloudFileError."""
+        source = self.sources[index]
+        return source if isinstance(source, PointCloud) else read_cloud(source, attributes=attributes)
+
+    def where(self, index: int) -> str:
+        """The scan's path, or what stands for it in a message."""
+        return str(self.path(index) or self.name(index))
+
+
+def as_scans(scans: Scans | str | Path | Iterable[str | Path | PointCloud]) -> Scans:
+    """What a caller may give for a sequence: what ``find_scans`` takes, or files or clouds in their order.
+
+    Raises CloudFileError, and FmrError where there are fewer than two.
+    """
+    if isinstance(scans, Scans):
+        return scans
+    if isinstance(scans, str | Path):
+        return find_scans(Path(scans))
+    sources: list[Path | PointCloud] = [s if isinstance(s, PointCloud) else Path(s) for s in scans]
+    if len(sources) < 2:
+        raise FmrError(f"{len(sources)} scans: a sequence has two or more")
+    return Scans(sources, range(len(sources)), len(sources))
 
 
 def find_scans(

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from fmr_cli import PointCloud, read_cloud, read_transform, write_cloud
+from fmr_cli import read_cloud, read_transform, write_cloud
 
 MANIFEST = """source,target,name
 a.ply,b.ply,
@@ -146,29 +146,3 @@ def test_an_output_folder_without_a_parent(fmr_here, folder):
     done = fmr_here("batch", "pairs.csv", "--out", "no/such", cwd=folder)
     assert done.returncode == 2
     assert "does not exist" in done.stderr
-
-
-def test_a_file_of_several_pairs_is_read_once(folder, monkeypatch):
-    from fmr_cli.batch import run as batch
-    from fmr_cli.registration.options import Options
-
-    read = []
-    monkeypatch.setattr(batch, "read_cloud", lambda path, **given: read.append(path.name) or read_cloud(path, **given))
-    monkeypatch.setattr(batch, "align", lambda *_: (_ for _ in ()).throw(ValueError("not of interest")))
-    (folder / "pairs.csv").write_text("source,target\n" + 8 * "a.ply,b.ply\nb.ply,a.ply\n")
-    work = batch.Batch(folder / "pairs.csv", folder / "out", Options(), aligned=False, merged=False)
-    work.open(resume=False)
-    assert len(list(work.run(0, workers=4))) == 16
-    assert sorted(read) == ["a.ply", "b.ply"]
-
-
-def test_the_cache_lets_go_of_what_was_used_longest_ago(tmp_path, monkeypatch):
-    from fmr_cli.batch import run as batch
-
-    monkeypatch.setattr(batch, "CACHED_POINTS", 250)
-    for name in "abc":
-        write_cloud(tmp_path / f"{name}.ply", PointCloud(np.random.default_rng(0).normal(size=(100, 3))))
-    clouds = batch.Clouds(keep=False, seed=0)
-    for name in "abac":
-        clouds.get(tmp_path / f"{name}.ply")
-    assert [path.stem for path in clouds.files] == ["a", "c"]

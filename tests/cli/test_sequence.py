@@ -13,42 +13,12 @@ import time
 
 import numpy as np
 import pytest
-from simulation import drive, make_street, scan
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
 from fmr_cli.cloud import angle_degrees
 from fmr_cli.io import read_poses, write_poses
-from fmr_cli.sequence.run import Sequence
-from fmr_cli.sequence.scans import find_scans
 
-FRAMES = 8
-MOVING = 14
-
-
-@pytest.fixture(scope="session")
-def street(tmp_path_factory):
-    """A folder of KITTI .bin scans of a drive that is in motion from its first scan on, and the true poses."""
-    folder = tmp_path_factory.mktemp("street")
-    rng, place, poses = np.random.default_rng(1), make_street(60), drive(60)[:FRAMES]
-    for i, pose in enumerate(poses):
-        points = scan(place, pose, rng, columns=450)
-        write_cloud(folder / f"{i}.bin", PointCloud(points, {"intensity": np.full(len(points), i, np.float32)}))
-    return folder, np.linalg.inv(poses[0]) @ poses
-
-
-@pytest.fixture(scope="session")
-def moving(tmp_path_factory):
-    """PCD scans by a scanner that moves while it scans, on its way into a bend, and true poses of their middles."""
-    folder, columns, start = tmp_path_factory.mktemp("moving"), 300, 18
-    rng, place = np.random.default_rng(3), make_street(60)
-    fine = drive(60, speed=8 / columns, turn=40 / columns, rest=0)[start * columns :]  # a pose a column
-    for i in range(MOVING):
-        points = scan(place, fine[i * columns : (i + 1) * columns], rng, columns=columns)
-        angle = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
-        nanoseconds = np.uint64(17e17 + 1e8 * i) + (1e8 / (2 * np.pi) * angle).astype(np.uint64)
-        write_cloud(folder / f"{i}.pcd", PointCloud(points, {"timestamp": nanoseconds}))
-    middles = fine[columns // 2 :: columns][:MOVING]
-    return folder, np.linalg.inv(middles[0]) @ middles
+FRAMES = 8  # of the street's drive
 
 
 def copy(street, tmp_path):
@@ -227,23 +197,6 @@ def test_deskew_undoes_the_motion_within_the_scans(fmr_here, moving, tmp_path):
     (shift, angle), (shift_deskewed, angle_deskewed) = end_errors
     assert shift_deskewed < min(0.06, shift / 3)
     assert angle_deskewed < min(0.15, angle / 5)
-
-
-def test_deskewed_and_resumed_it_comes_to_the_same_poses(moving, tmp_path):
-    whole, cut = (
-        Sequence(find_scans(moving[0], stop=6), tmp_path / name, deskew=True) for name in ("whole.txt", "cut.txt")
-    )
-    whole.open(resume=False)
-    list(whole.run())
-    cut.open(resume=False)
-    run = cut.run()
-    for _ in range(4):
-        next(run)
-    run.close()
-    again = Sequence(cut.scans, cut.out, deskew=True)
-    assert again.open(resume=True) == 4
-    list(again.run())
-    assert np.array_equal(read_poses(cut.out), read_poses(whole.out))
 
 
 def test_deskew_of_scans_without_times_is_one_line(fmr_here, street, tmp_path):

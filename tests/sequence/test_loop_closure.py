@@ -7,7 +7,7 @@ import pytest
 from simulation import drive, make_street, scan
 
 from fmr_cli.sequence.loop_closure import close_loops
-from fmr_cli.sequence.odometry import Scan
+from fmr_cli.sequence.prepared_scan import PreparedScan
 
 pytest.importorskip("gtsam")
 VOXEL = 0.4
@@ -20,7 +20,7 @@ def test_a_drifted_round_is_closed():
 
     def load(index):
         if index not in scans:
-            scans[index] = Scan(scan(place, poses[index], rng, columns=450) / VOXEL, np.zeros(3))
+            scans[index] = PreparedScan(scan(place, poses[index], rng, columns=450) / VOXEL, np.zeros(3))
         return scans[index]
 
     drifted = truth.copy()

@@ -7,7 +7,9 @@ import pytest
 from simulation import drive, make_street, scan
 
 from fmr_cli.io import read_cloud, read_poses
-from fmr_cli.sequence.odometry import Odometry, choose_voxel
+from fmr_cli.sequence.odometry import Odometry
+from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
+from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 REFERENCE = "reference_poses.txt"
 
@@ -19,15 +21,17 @@ def turning():
     return [scan(place, pose, rng, columns=450) for pose in poses], poses
 
 
-def run(scans, **settings):
-    odometry = Odometry(choose_voxel(scans[0]), np.median(scans[0], axis=0), **settings)
-    return [odometry.register(odometry.prepare(points)) for points in scans]
+def run(scans):
+    """Each scan's frame; None stands for a scan that could not be read."""
+    frame = VoxelFrame(choose_voxel(scans[0]), np.median(scans[0], axis=0))
+    odometry = Odometry(frame)
+    return [odometry.register(None if points is None else prepare_scan(points, frame)) for points in scans]
 
 
 def errors(frames, truth):
     """Shift of each frame from the truth, as a share of the path so far; and the first step's shift alone."""
     truth = np.linalg.inv(truth[0]) @ truth
-    shift = np.linalg.norm([f.pose[:3, 3] - T[:3, 3] for f, T in zip(frames, truth, strict=True)], axis=1)
+    shift = np.linalg.norm([f.T_first_scan[:3, 3] - T[:3, 3] for f, T in zip(frames, truth, strict=True)], axis=1)
     length = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
     return shift[-1] / length, shift[1]
 
@@ -54,9 +58,9 @@ def test_the_unit_and_the_place_do_not_matter(turning):
     far = np.array([600_000.0, 5_000_000.0, 100.0])
     metres, millimetres = run(scans), run([points * 1000 for points in scans])
     for a, b in zip(metres, millimetres, strict=True):
-        assert np.allclose(a.pose[:3, 3] * 1000, b.pose[:3, 3], atol=1.0)
+        assert np.allclose(a.T_first_scan[:3, 3] * 1000, b.T_first_scan[:3, 3], atol=1.0)
     shifted = run([points + far for points in scans])
-    moved = np.array([frame.pose[:3, :3] @ far + frame.pose[:3, 3] - far for frame in shifted])
+    moved = np.array([frame.T_first_scan[:3, :3] @ far + frame.T_first_scan[:3, 3] - far for frame in shifted])
     true = (np.linalg.inv(truth[0]) @ truth)[:, :3, 3]
     assert np.abs(moved - true).max() < 0.05
 
@@ -64,17 +68,16 @@ def test_the_unit_and_the_place_do_not_matter(turning):
 def test_the_same_scans_give_the_same_poses_bit_for_bit(turning):
     scans = turning[0][:6]
     for a, b in zip(run(scans), run(scans), strict=True):
-        assert np.array_equal(a.pose, b.pose)
+        assert np.array_equal(a.T_first_scan, b.T_first_scan)
 
 
 def test_a_missing_scan_is_bridged_by_the_motion_before(turning):
     scans, truth = turning[0][:10], turning[1][:10]
-    odometry = Odometry(choose_voxel(scans[0]), np.median(scans[0], axis=0))
-    frames = [odometry.register(None if i == 6 else odometry.prepare(points)) for i, points in enumerate(scans)]
+    frames = run([None if i == 6 else points for i, points in enumerate(scans)])
     assert [i for i, frame in enumerate(frames) if frame.status != "aligned"] == [6]
     true = (np.linalg.inv(truth[0]) @ truth)[:, :3, 3]
-    assert np.linalg.norm(frames[6].pose[:3, 3] - true[6]) < 0.3
-    assert np.linalg.norm(frames[9].pose[:3, 3] - true[9]) < 0.05
+    assert np.linalg.norm(frames[6].T_first_scan[:3, 3] - true[6]) < 0.3
+    assert np.linalg.norm(frames[9].T_first_scan[:3, 3] - true[9]) < 0.05
 
 
 @pytest.mark.parametrize(("folder", "suffix"), [("kitti_seq/velodyne", ".bin"), ("hdl64", ".pcd")])

@@ -1,0 +1,122 @@
+"""The last keyframes as one map, and how well a scan fits it. Lengths are in voxels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import small_gicp
+
+from fmr_cli.cloud import transform_points
+from fmr_cli.sequence.plane_map import PlaneMap
+from fmr_cli.sequence.prepared_scan import PreparedScan
+
+# Edges of the map's three levels, voxels: the working one, and two from which larger motions are reached.
+FINE, COARSE, WIDE = 1.0, 2.0, 8.0
+REACH = 3.0  # edges of the level within which a point's counterpart is sought
+MAX_ITERATIONS = 30  # of small_gicp at one level; it rarely takes half of them
+ROTATION_EPSILON, TRANSLATION_EPSILON = 1e-4, 1e-2  # radians, voxels, at an edge of 1: a step that moves less ends it
+# Keyframes that the map is rebuilt from once it holds twice as many. Set by hand: it bounds the memory, and holds what
+# is within sight of any sensor at KEYFRAME_MOTION apart (see ``odometry``).
+MAP_KEYFRAMES = 20
+# What a point without counterpart costs where two poses are compared, in the unit of ``Fit.cost``. Set by hand: more
+# than a counterpart costs at the end of the reach that still fits.
+OUTLIER_COST = 4.0
+NO_LRU = 1 << 30  # insertions after which small_gicp would forget a voxel: never
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A scan's pose against the map, T_map_scan (4, 4), and what it comes to.
+
+    overlap: the share of the scan's points that have a counterpart on the map. cost: their mean squared distance over
+    the local variance, halved. start: the initial guess it came from. rms: distance of those points from the map's
+    planes, voxels, NaN before ``LocalMap.polish``.
+    """
+
+    T_map_scan: np.ndarray
+    overlap: float
+    cost: float
+    start: str
+    rms: float = float("nan")
+
+    @property
+    def total(self) -> float:
+        """Cost a point, those without counterpart included: the smaller, the better the pose."""
+        return self.overlap * self.cost + (1 - self.overlap) * OUTLIER_COST
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A scan that is part of the map: its place in the sequence, itself, and its pose (4, 4)."""
+
+    index: int
+    scan: PreparedScan
+    T_map_scan: np.ndarray
+
+
+class LocalMap:
+    """The last keyframes as Gaussian voxel maps of three edges, and as planes.
+
+    It is a function of ``keyframes`` alone: so it can be built again after a kill.
+    """
+
+    def __init__(self) -> None:
+        self.keyframes: list[Keyframe] = []
+        self._clear()
+
+    def _clear(self) -> None:
+        self.levels = {edge: small_gicp.GaussianVoxelMap(edge) for edge in (FINE, COARSE, WIDE)}
+        for level in self.levels.values():
+            level.set_lru(horizon=NO_LRU)
+        self.planes = PlaneMap()
+
+    def insert(self, index: int, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
+        """Add a keyframe; where there are many, the oldest are forgotten."""
+        self.keyframes.append(Keyframe(index, scan, T_map_scan))
+        added = self.keyframes[-1:]
+        if len(self.keyframes) >= 2 * MAP_KEYFRAMES:
+            self._clear()
+            added = self.keyframes = self.keyframes[-MAP_KEYFRAMES:]
+        for keyframe in added:
+            for level in self.levels.values():
+                level.insert(keyframe.scan.cloud, keyframe.T_map_scan)
+            self.planes.insert(keyframe.scan.points, keyframe.scan.normals, keyframe.T_map_scan)
+
+    def fit(self, scan: PreparedScan, T_map_guess: np.ndarray, edges: tuple[float, ...], start: str) -> Fit:
+        """The scan's pose near a guess, by distribution-to-distribution ICP on the levels ``edges``, one after another.
+
+        start: what the guess is called.
+        """
+        T_map_scan = T_map_guess
+        for edge in edges:
+            found = small_gicp.align(
+                self.levels[edge], scan.cloud, T_map_scan, max_correspondence_distance=REACH * edge, num_threads=1,
+                max_iterations=MAX_ITERATIONS, rotation_epsilon=ROTATION_EPSILON * edge,
+                translation_epsilon=TRANSLATION_EPSILON * edge,
+            )  # fmt: skip
+            T_map_scan = found.T_target_source
+        inliers = max(found.num_inliers, 1)
+        return Fit(T_map_scan, found.num_inliers / len(scan), found.error / inliers, start)
+
+    def polish(self, scan: PreparedScan, fit: Fit, slope: float) -> tuple[Fit, float]:
+        """The fit with the pose that robust weights give, and this scan's slope.
+
+        slope: how residuals grow with range, see ``plane_map.trust``.
+        """
+        T_map_scan, rms, slope = self.planes.fit(scan.points, scan.normals, scan.ranges, fit.T_map_scan, slope)
+        return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms), slope
+
+
+def displacement(T_map_a: np.ndarray, T_map_b: np.ndarray, points: np.ndarray) -> float:
+    """How far apart two poses put points (N, 3), on average: rotation and shift in one figure."""
+    apart = transform_points(T_map_a, points) - transform_points(T_map_b, points)
+    return float(np.linalg.norm(apart, axis=1).mean())
+
+
+def orthonormal(T_a_b: np.ndarray) -> np.ndarray:
+    """T_a_b with its rotation made exact, so that rounding does not grow from frame to frame."""
+    U, _, Vt = np.linalg.svd(T_a_b[:3, :3])
+    T_a_b = T_a_b.copy()
+    T_a_b[:3, :3] = U @ Vt
+    return T_a_b

@@ -1,0 +1,39 @@
+"""How to register a sequence: every option, checked where it is made."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from fmr_cli.errors import FmrError
+
+Format = Literal["kitti", "tum", "json"]
+FORMATS = get_args(Format)
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """How to register a sequence. Lengths are in the scans' own unit; None means: taken from the data.
+
+    format: of the file of poses. camera_frame: poses of the camera that ``calib.txt`` tells of, as KITTI's own truth.
+    voxel_size: the working voxel edge. merged_voxel: the map's voxel edge, or None: half the working one.
+    loop_closure: at the end, recognise places seen before and optimise the pose graph.
+    deskew: undo the motion within each scan, by the times of its points; its pose is that of the middle of the scan.
+    Raises FmrError for a format that is not known, and for a voxel edge that is no positive number.
+    """
+
+    format: Format = "kitti"
+    camera_frame: bool = False
+    voxel_size: float | None = None
+    merged_voxel: float | None = None
+    loop_closure: bool = False
+    deskew: bool = False
+
+    def __post_init__(self) -> None:
+        if self.format not in FORMATS:
+            raise FmrError(f"format {self.format!r}: is not known, use one of {', '.join(FORMATS)}")
+        for name in ("voxel_size", "merged_voxel"):
+            edge = getattr(self, name)
+            if edge is not None and not (math.isfinite(edge) and edge > 0):
+                raise FmrError(f"{name} {edge}: must be more than 0, or left out to follow from the scans")

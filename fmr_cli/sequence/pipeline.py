@@ -1,0 +1,171 @@
+"""The way of a sequence: scans in; a trajectory, a table of residuals and a map out, frame by frame, resumable.
+
+begin (or go on) -> [read, thin -> register -> files] for each scan -> close loops -> files
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import fmr_cli
+from fmr_cli.cloud import PointCloud, angle_degrees
+from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
+from fmr_cli.sequence.deskew import scan_times
+from fmr_cli.sequence.journal import Beginning, Journal
+from fmr_cli.sequence.loader import Loader
+from fmr_cli.sequence.loop_closure import check_installed, close_loops
+from fmr_cli.sequence.odometry import Frame, Odometry
+from fmr_cli.sequence.options import SequenceOptions
+from fmr_cli.sequence.outputs import Outputs
+from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
+from fmr_cli.sequence.result import SequenceResult
+from fmr_cli.sequence.scans import Scans, as_scans
+from fmr_cli.sequence.voxel_frame import VoxelFrame
+
+OnRow = Callable[[dict[str, Any], int, int], None]
+
+
+def align_sequence(
+    scans: Scans | str | Path | Iterable[str | Path | PointCloud], out: Path | None = None,
+    options: SequenceOptions = SequenceOptions(), *, residuals: Path | None = None, merged: Path | None = None,
+    resume: bool = False, on_row: OnRow | None = None,
+) -> SequenceResult:  # fmt: skip
+    """Register every scan into the frame of the first.
+
+    scans: a folder, a KITTI sequence or drive, a text file that lists scans (see ``find_scans``), or files or clouds in
+    their order. out: the file of poses, written as they are made; a journal beside it lets ``resume`` go on after a
+    kill, to the same poses. residuals: a CSV row a frame. merged: the map, a point a voxel. Nothing is written where no
+    file is named. on_row: called with each new row, how many rows there are now, and of how many.
+    Raises FmrError where the options ask for what the scans do not have, or a journal was begun otherwise;
+    RegistrationError where the first scan cannot be used. A later scan that cannot be used is bridged.
+    """
+    scans = as_scans(scans)
+    check(scans, options, out, resume)
+    journal = Journal(out, settings(scans, options))
+    beginning, done = (journal.read() if resume else None) or (begin(scans, options), [])
+
+    rows: list[dict[str, Any]] = []
+    poses: list[np.ndarray] = []  # T_first_scan of every frame so far; the loader deskews by the last two
+    loader = Loader(scans, beginning, poses, deskewed=options.deskew, keep_clouds=merged is not None)
+    odometry = Odometry(beginning.frame)
+    go_on(done, rows, poses, loader, odometry)
+
+    files = Outputs(
+        scans, options, journal, out=out, residuals=residuals, merged=merged, voxel=beginning.frame.voxel
+    )  # fmt: skip
+    with files, closing(loader.ahead(len(rows))) as loaded_scans:
+        files.begin(beginning, done, rows, poses, loader)
+        for loaded in loaded_scans:
+            frame, seconds = timed(odometry.register, loaded.scan, scans.where(loaded.index))
+            poses.append(frame.T_first_scan)
+            rows.append(loaded.row | described(frame, poses) | {"register_s": seconds})
+            state = {"size": loaded.size, "T_map_scan": odometry.T_map_last[-1].tolist(), "state": odometry.state()}
+            files.add(rows[-1], poses[-1], loaded.cloud, state)
+            if on_row:
+                on_row(rows[-1], len(rows), len(scans))
+
+        path, loops = np.stack(poses), 0
+        if options.loop_closure:
+            path, loops = close(path, rows, beginning.frame, loader)
+        before = files.written(np.stack(poses)) if options.loop_closure else None
+        result = SequenceResult(files.written(path), rows, beginning.frame.voxel, before, loops, out)
+        files.finish(result, path, loader)
+    return result
+
+
+def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool) -> None:
+    """Raises FmrError where the options ask for what is not there, before anything is read."""
+    if options.camera_frame and scans.T_camera_scan is None:
+        raise FmrError(f"{scans.where(0)}: no calib.txt with a line Tr beside it, leave out --camera-frame")
+    if options.loop_closure:
+        check_installed()
+    if resume and (out is None or any(scans.path(i) is None for i in range(len(scans)))):
+        raise FmrError("resume needs a file of poses, and scans in files; leave it out")
+
+
+def settings(scans: Scans, options: SequenceOptions) -> dict[str, Any]:
+    """What must be the same in the run that is resumed."""
+    return {
+        "version": fmr_cli.__version__,
+        "files": [scans.where(index) for index in range(len(scans))],
+        "voxel_size": options.voxel_size,
+        "deskew": options.deskew,
+    }
+
+
+def begin(scans: Scans, options: SequenceOptions) -> Beginning:
+    """What follows from the first scan, and for deskewing from the first two. Raises CloudFileError."""
+    try:
+        cloud = scans.read(0, attributes=options.deskew)
+    except CloudFileError as error:
+        raise CloudFileError(f"{error}; or leave this first scan out with --start") from None
+    if options.deskew:
+        scan_times(cloud)  # says before anything is written that points have no times
+    frame = VoxelFrame(options.voxel_size or choose_voxel(cloud.points), np.median(cloud.points, axis=0))
+    return Beginning(frame, first_motion(scans, frame) if options.deskew else np.eye(4))
+
+
+def first_motion(scans: Scans, frame: VoxelFrame) -> np.ndarray:
+    """T_first_second (4, 4), file units, by the two scans as they are, which are skewed alike."""
+    odometry = Odometry(frame)
+    try:
+        pair = [prepare_scan(scans.read(index, attributes=False).points, frame) for index in (0, 1)]
+        _, second = [odometry.register(scan) for scan in pair]
+    except (CloudFileError, RegistrationError):
+        return np.eye(4)  # the run itself says what is wrong with them
+    return second.T_first_scan if second.status == "aligned" else np.eye(4)
+
+
+def go_on(
+    done: list[dict[str, Any]], rows: list[dict[str, Any]], poses: list[np.ndarray], loader: Loader, odometry: Odometry
+) -> None:
+    """Put everything where it was after the frames that an earlier run has done; done: its lines of the journal."""
+    if not done:
+        return
+    T_map_scan = [np.array(line["T_map_scan"]) for line in done]
+    rows.extend(line["row"] for line in done)
+    poses.extend(odometry.frame.pose_to_file(T) for T in T_map_scan)
+    loader.usual_sizes.extend(line["size"] for line in done if line["size"])
+    odometry.restore(done[-1]["state"], T_map_scan, loader.scan)
+
+
+def timed(register: Callable[[Any], Frame], scan: Any, name: str) -> tuple[Frame, float]:
+    """The frame and the seconds it took. Raises RegistrationError with the scan's name."""
+    start = time.perf_counter()
+    try:
+        return register(scan), round(time.perf_counter() - start, 4)
+    except RegistrationError as error:
+        raise RegistrationError(f"{name}: {error}") from None
+
+
+def described(frame: Frame, poses: list[np.ndarray]) -> dict[str, Any]:
+    """The frame's part of its row; poses: T_first_scan up to its own."""
+    T_before_scan = np.linalg.inv(poses[-2] if len(poses) > 1 else poses[-1]) @ poses[-1]
+    row: dict[str, Any] = {"status": frame.status, "start": frame.start, "overlap": round(frame.overlap, 4)}
+    if math.isfinite(frame.inlier_rmse):
+        row["inlier_rmse"] = six_digits(frame.inlier_rmse)
+    if frame.feature_errors:
+        row["feature_error_before"], row["feature_error_after"] = map(six_digits, frame.feature_errors)
+    row["motion"] = six_digits(np.linalg.norm(T_before_scan[:3, 3]))
+    row["rotation_deg"] = six_digits(angle_degrees(T_before_scan))
+    return row
+
+
+def six_digits(value: float | np.floating) -> float:
+    return float(f"{value:.6g}")
+
+
+def close(
+    T_first_scan: np.ndarray, rows: list[dict[str, Any]], frame: VoxelFrame, loader: Loader
+) -> tuple[np.ndarray, int]:
+    """The path (n, 4, 4) with its loops closed, and how many there were."""
+    sure = np.array([row["status"] == "aligned" for row in rows])
+    closed, loops = close_loops(np.stack([frame.pose_to_voxels(T) for T in T_first_scan]), sure, loader.scan)
+    return np.stack([frame.pose_to_file(T_map_scan) for T_map_scan in closed]), len(loops)

@@ -1,0 +1,81 @@
+"""A scan made ready for the odometry, and the working voxel that fits a sequence. Lengths are in voxels."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import small_gicp
+
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import RegistrationError
+from fmr_cli.sequence.voxel_frame import VoxelFrame
+
+if TYPE_CHECKING:
+    from fmr_cli.registration.prepared import Prepared
+
+# Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
+# gains nothing measurable.
+WORKING_POINTS = 12_000
+POINTS_PER_VOXEL = 4  # of a scan that has few points, on average: finer voxels would hold no surface
+NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice
+MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
+STEPS = 6  # of the search for the voxel, at most; each brings the count within a few percent
+COUNT_TOLERANCE = 0.1  # share by which the count may miss WORKING_POINTS
+# The count goes with the edge to the power of -1.5 to -2 (the rings of a LiDAR, a surface): -1 / 0.6 lies in between.
+EDGE_PER_COUNT = 0.6
+
+
+class PreparedScan:
+    """A scan in voxels: thinned ``points`` (N, 3), unit ``normals`` towards the sensor, ``ranges`` (N,) from it.
+
+    ``cloud`` is the same for small_gicp, with a covariance per point.
+    """
+
+    def __init__(self, points: np.ndarray, sensor: np.ndarray) -> None:
+        """points: (M, 3) before thinning; sensor: (3,); both in voxels."""
+        # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
+        self.cloud = small_gicp.PointCloud(small_gicp.voxelgrid_sampling(points, 1.0).points())
+        small_gicp.estimate_normals_covariances(self.cloud, num_neighbors=NEIGHBOURS)
+        self.points = self.cloud.points()[:, :3]
+        self.normals = self.cloud.normals()[:, :3]
+        rays = self.points - sensor
+        self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
+        self.ranges = np.linalg.norm(rays, axis=1)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def for_align(self) -> Prepared:
+        """The scan as feature-metric registration takes it, which encodes it once."""
+        from fmr_cli.registration.pipeline import prepare
+
+        return prepare(PointCloud(self.points))
+
+
+def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
+    """Points (N, 3), file units, made ready; None where too few are left. Safe in another thread."""
+    if len(points) < MIN_POINTS:
+        return None
+    scan = PreparedScan(frame.points_to_voxels(points), frame.sensor)
+    return scan if len(scan) >= MIN_POINTS else None
+
+
+def choose_voxel(points: np.ndarray) -> float:
+    """The voxel edge that thins points (N, 3) to WORKING_POINTS, or to a quarter of them where they are few.
+
+    In the points' unit, to two digits. Raises RegistrationError where all points are in one place.
+    """
+    wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
+    spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
+    if not spread > 0 or wanted < MIN_POINTS:
+        raise RegistrationError("too few points, or all in one place")
+    voxel, centre = spread / 20, np.median(points, axis=0)
+    for _ in range(STEPS):
+        count = small_gicp.voxelgrid_sampling((points - centre) / voxel, 1.0).size()
+        if abs(count / wanted - 1) < COUNT_TOLERANCE:
+            break
+        voxel *= (count / wanted) ** EDGE_PER_COUNT
+    return float(f"{voxel:.2g}")

@@ -1,0 +1,64 @@
+"""What a sequence gives: a pose and a row for every scan, and what a person should know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SequenceResult:
+    """The trajectory of a sequence and everything said about it.
+
+    poses: (n, 4, 4) float64, each scan's frame to the first one's, file units; the camera's where that was asked for.
+    rows: one a frame: frame, file, status ("aligned" or "uncertain"), start, points, overlap, inlier_rmse, motion,
+    rotation_deg, seconds, and a message where something was wrong with the scan.
+    voxel_size: the working voxel edge, file units. odometry_poses: (n, 4, 4) before loops were closed, or None where
+    that was not asked for; loops: how many were closed. out: the file of poses, or None.
+    """
+
+    poses: np.ndarray
+    rows: list[dict[str, Any]]
+    voxel_size: float
+    odometry_poses: np.ndarray | None = None
+    loops: int = 0
+    out: Path | None = None
+
+    @property
+    def status(self) -> str:
+        """ "aligned" where every frame is."""
+        return "uncertain" if self.uncertain else "aligned"
+
+    @property
+    def uncertain(self) -> list[dict[str, Any]]:
+        """The rows of the frames that are not to be trusted."""
+        return [row for row in self.rows if row["status"] != "aligned"]
+
+    def summary(self) -> list[str]:
+        """What a person wants to know at the end, a line each."""
+        length = sum(row["motion"] for row in self.rows)
+        residuals = [row["inlier_rmse"] for row in self.rows[1:] if "inlier_rmse" in row]
+        written = f": {self.out}" if self.out else ""
+        lines = [f"{len(self.rows)} frames, path length {length:.6g}, voxel {self.voxel_size:g}{written}"]
+        if self.odometry_poses is not None:
+            before = f"; the path before: {odometry_path(self.out)}" if self.out else ""
+            lines.append(f"{self.loops} loops closed{before}")
+        if residuals:
+            worst = max(self.rows[1:], key=lambda row: row.get("inlier_rmse", 0.0))
+            lines.append(
+                f"residual: median {np.median(residuals):.4g}, "
+                f"worst {worst['inlier_rmse']:.4g} in frame {worst['frame']} ({worst['file']})"
+            )
+        if self.uncertain:
+            names = ", ".join(f"{row['frame']} ({row['file']})" for row in self.uncertain[:20])
+            more = len(self.uncertain) - 20
+            lines.append(f"{len(self.uncertain)} uncertain, look at: {names}{f' and {more} more' if more > 0 else ''}")
+        return lines
+
+
+def odometry_path(out: Path) -> Path:
+    """Where the poses before loop closure go."""
+    return out.with_name(f"{out.stem}.odometry{out.suffix}")

@@ -1,0 +1,73 @@
+"""`align_batch`: the same rows as in its file, told as they come, whatever ends the run."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from fmr_cli import Options, read_cloud
+from fmr_cli.batch import align_batch, cache
+from fmr_cli.batch import one_pair as runner
+from fmr_cli.errors import CloudFileError
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+
+
+class CutError(Exception):
+    """Stands for whatever ends a process."""
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    """Four pairs, of which the second has no target."""
+    a, b = SAMPLES / "scan_a.ply", SAMPLES / "scan_b.ply"
+    path = tmp_path / "pairs.csv"
+    path.write_text(f"source,target\n{a},{b}\n{a},nowhere.ply\n{b},{a}\n{b},{b}\n")
+    return path
+
+
+def table(out):
+    with (out / "results.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_it_returns_the_rows_of_its_file_and_tells_each(manifest, tmp_path):
+    told = []
+    rows = align_batch(
+        manifest, tmp_path / "out", on_row=lambda row, done, total: told.append((row["status"], done, total))
+    )
+    assert rows == table(tmp_path / "out")
+    assert told == [("aligned", 1, 4), ("failed", 2, 4), ("aligned", 3, 4), ("aligned", 4, 4)]
+    assert not (tmp_path / "out" / "aligned").exists()
+
+
+def test_cut_off_and_gone_on_with_it_keeps_the_rows_it_has(manifest, tmp_path):
+    def cut(row, done, total):
+        if done == 2:
+            raise CutError
+
+    with pytest.raises(CutError):
+        align_batch(manifest, tmp_path / "out", on_row=cut)
+    before = table(tmp_path / "out")
+    assert len(before) == 2
+    with pytest.raises(CloudFileError, match="is there already"):
+        align_batch(manifest, tmp_path / "out")
+    told = []
+    rows = align_batch(manifest, tmp_path / "out", resume=True, on_row=lambda row, done, total: told.append(done))
+    assert told == [3, 4]
+    assert rows[:2] == before
+    assert rows == table(tmp_path / "out")
+    with pytest.raises(CloudFileError, match="other settings"):
+        align_batch(manifest, tmp_path / "out", Options(seed=1), resume=True)
+
+
+def test_a_file_of_several_pairs_is_read_once(tmp_path, monkeypatch):
+    read = []
+    monkeypatch.setattr(cache, "read_cloud", lambda path, **given: read.append(path.name) or read_cloud(path, **given))
+    monkeypatch.setattr(runner, "align", lambda *_: (_ for _ in ()).throw(ValueError("not of interest")))
+    a, b = SAMPLES / "scan_a.ply", SAMPLES / "scan_b.ply"
+    (tmp_path / "pairs.csv").write_text("source,target\n" + 8 * f"{a},{b}\n{b},{a}\n")
+    assert len(align_batch(tmp_path / "pairs.csv", tmp_path / "out", workers=4)) == 16
+    assert sorted(read) == ["scan_a.ply", "scan_b.ply"]
