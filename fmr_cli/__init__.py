@@ -24,8 +24,6 @@ _HOME = {
     "Options": "fmr_cli.registration",
     "align_batch": "fmr_cli.batch",
     "align_sequence": "fmr_cli.sequence",
-    "align_batch": "fmr_cli.batch",
-    "align_sequence": "fmr_cli.sequence",
     "SequenceOptions": "fmr_cli.sequence",
 }
 

@@ -15,6 +15,7 @@ from fmr_cli.batch.cache import CloudCache
 from fmr_cli.batch.manifest import Pair, read_manifest
 from fmr_cli.batch.one_pair import PairRunner
 from fmr_cli.batch.results import ResultsTable
+from fmr_cli.cores import usable_cores
 from fmr_cli.registration import Options
 from fmr_cli.registration.result import plain
 

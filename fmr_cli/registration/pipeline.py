@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -102,7 +103,7 @@ def look(source: Prepared, target: Prepared, options: Options, threads: int, tim
     return judge
 
 
-def from_given(judge: Judge, init: str | np.ndarray, time: Stopwatch) -> Judge:
+def from_given(judge: Judge, init: Any, time: Stopwatch) -> Judge:
     """A pose that is given, as it is; where that does not fit, where the paper's solver goes from it."""
     pair, name = judge.pair, init if isinstance(init, str) else "given"
     T = np.eye(4) if isinstance(init, str) else np.asarray(init, float)
