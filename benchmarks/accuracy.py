@@ -22,13 +22,13 @@ from benchmarks.common import (
     console,
     folder_clouds,
     make_pair,
-    pose_error,
     room_clouds,
     save,
     shape_clouds,
     show,
     ways,
 )
+from fmr_cli.geometry.pose_error import pose_error
 
 DEGREES, SHIFT = 5.0, 0.1  # of a pose that counts as found
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
+from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.cores import usable_cores
 from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.registration.options import Options
@@ -86,12 +86,6 @@ def make_pair(protocol: str, points: np.ndarray, rng: np.random.Generator) -> tu
         source, target = (x + rng.normal(size=x.shape) * sigma for x in (source, target))
     T = random_pose(rng, None if protocol == "so3" else 60.0, 1.0)
     return source, transform_points(T, target), T
-
-
-def pose_error(found: np.ndarray, truth: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
-    """Degrees, and how far the moved centre lies from where it belongs."""
-    off = transform_points(found, centre[None]) - transform_points(truth, centre[None])
-    return angle_degrees(np.linalg.inv(truth) @ found), float(np.linalg.norm(off))
 
 
 def ways(voxel: float, reach: float) -> dict[str, Way]:

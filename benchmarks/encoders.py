@@ -17,7 +17,7 @@ import torch
 
 from benchmarks.common import show
 from fmr_cli.evaluation.heldout import HARD, Setting, score
-from fmr_cli.feature_metric.encoder import load_encoder
+from fmr_cli.registration.models import load_encoder
 from fmr_cli.synthetic import scenes, shapes
 from fmr_cli.training.scans import crops_of
 

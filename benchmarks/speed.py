@@ -35,13 +35,13 @@ from benchmarks.common import (
     folder_clouds,
     interleaved,
     make_pair,
-    pose_error,
     room_clouds,
     save,
     show,
     ways,
 )
-from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
+from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import write_cloud
 from fmr_cli.registration.models import bundled_encoder, fast_encoder
 from fmr_cli.registration.options import Options
@@ -101,11 +101,14 @@ def ic(setup: Setup) -> Rows:
     def ours(threads: int) -> Any:
         return fast.solve(fast.template(P, threads), Q, np.eye(4)[None], 10, False, threads=threads).g
 
+    runs["fmr, 1 thread, all points in every iteration"] = lambda: (
+        fast.solve_all(fast.template(P), Q, np.eye(4)[None], 10, False, None, map).g
+    )
     runs |= {f"fmr, {threads} threads": partial(ours, threads) for threads in sorted({1, CORES})}
     with ThreadpoolController().limit(limits=1, user_api="blas"):
         found = {name: np.asarray(run())[0].astype(float) for name, run in runs.items()}
         seconds = interleaved(runs, setup.repeats, warm=True)
-    off = {name: angle_degrees(np.linalg.inv(truth) @ T) for name, T in found.items()}
+    off = {name: float(pose_error(T, truth)[0]) for name, T in found.items()}
     return [row(name, s, seconds["PyTorch"], more={"off, deg": off[name]}) for name, s in seconds.items()]
 
 

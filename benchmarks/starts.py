@@ -22,7 +22,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from benchmarks.common import PEERS, Way
-from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
+from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import read_cloud
 from fmr_cli.registration.hypotheses import Hypothesis, from_features, from_search
 from fmr_cli.registration.options import Options
@@ -96,11 +97,9 @@ def main() -> None:
             found = way(pair)
             took = time.perf_counter() - begin
             best = max(found, key=lambda h: h.score) if found else Hypothesis(np.eye(4), name)
-            errors = [
-                (angle_degrees(np.linalg.inv(T) @ X), np.linalg.norm((X - T)[:3, 3]) / pair.edge)
-                for X in (best.T_target_source, refined(pair, best))
-            ]
-            rows[name].append((errors[0][0] < 15 and errors[0][1] < 6, errors[1][0] < 5 and errors[1][1] < 2, took))
+            degrees, shift = pose_error(np.stack([best.T_target_source, refined(pair, best)]), T)
+            right = (degrees < (15, 5)) & (shift < np.array([6, 2]) * pair.edge)
+            rows[name].append((*right, took))
     print(f"{'start':16s} pairs  found  refined  median s")
     for name, row in rows.items():
         found_share, right, seconds = np.array(row, float).T

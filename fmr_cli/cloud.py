@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Array = TypeVar("Array", np.ndarray, "Tensor")
 
 NORMALS = ("nx", "ny", "nz")
 PULSE = ("x_t", "y_t", "z_t")  # the direction of a LAS waveform, in coordinates per picosecond
@@ -85,13 +90,17 @@ class PointCloud:
         return moved
 
 
-def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """R x + t for every row x of points (N, 3); T is 4x4, both float64."""
-    return points @ T[:3, :3].T + T[:3, 3]
+def transform_points(T: Array, points: Array) -> Array:
+    """R x + t for every row x of points (..., N, 3); T is (..., 4, 4); numpy or torch, batch dimensions broadcast."""
+    return points @ T[..., :3, :3].swapaxes(-1, -2) + T[..., None, :3, 3]
+
+
+def rotation_angle(R: np.ndarray) -> np.ndarray:
+    """The angles of rotations (..., 3, 3) in radians, (...); exact near zero and near pi, where arccos is not."""
+    x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    return np.arctan2(np.sqrt(x * x + y * y + z * z), R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1)
 
 
 def angle_degrees(T: np.ndarray) -> float:
-    """The rotation angle of T's (scaled) rotation, degrees."""
-    R = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
-    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.degrees(np.arctan2(sine, np.trace(R) - 1)))
+    """The rotation angle of T's (scaled) rotation, degrees: (4, 4) or (3, 3)."""
+    return float(np.degrees(rotation_angle(T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3])))))

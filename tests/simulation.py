@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fmr_cli.geometry.se3 import exp
+
 STEP = 0.1  # seconds between scans
 
 
@@ -116,3 +118,10 @@ def keep_nearest(
     roof = top / tangent
     roof = np.where((tangent < 0) & (roof > enter[:, None]) & (roof < leave[:, None]), roof, np.inf)
     distance[hit] = np.minimum(distance[hit], np.minimum(side, roof))
+
+
+def turn_and_shift(degrees: float, shift: float, axis: tuple[float, float, float] = (0.36, 0.48, 0.8)) -> np.ndarray:
+    """The pose (4, 4) of a turn about a unit axis and a shift by so much in a fixed direction."""
+    T = exp(np.radians([*(degrees * np.array(axis)), 0, 0, 0]))
+    T[:3, 3] = shift * np.array([0.6, -0.64, 0.48])
+    return T

@@ -12,9 +12,10 @@ import pytest
 import torch
 
 from benchmarks import paper, speed
-from benchmarks.common import PROTOCOLS, interleaved, make_pair, pose_error, room_clouds
+from benchmarks.common import PROTOCOLS, interleaved, make_pair, room_clouds
 from fmr_cli.cloud import PointCloud, transform_points
-from fmr_cli.geometry.motion import exp
+from fmr_cli.geometry.pose_error import pose_error
+from fmr_cli.geometry.se3 import exp
 from fmr_cli.io import write_cloud
 from fmr_cli.registration.models import bundled_encoder
 

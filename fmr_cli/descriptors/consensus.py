@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmr_cli.geometry.motion import Motion, rotation_between
+from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.pose_error import angle_between
 
 SEEDS, NEIGHBOURS = 60, 20
 POWER_STEPS = 4  # of the leading eigenvector: the order of the seeds has settled by then
@@ -36,7 +37,7 @@ def consensus(
     kept: list[int] = []
     moved = T[:, :3, :3] @ source.mean(0) + T[:, :3, 3]
     for i in np.argsort(-inliers, kind="stable"):
-        turned = rotation_between(T[i, :3, :3], T[kept, :3, :3]) > APART
+        turned = angle_between(T[i, :3, :3], T[kept, :3, :3]) > APART
         if np.all(turned | (np.linalg.norm(moved[i] - moved[kept], axis=-1) > 2 * tolerance)):
             kept.append(int(i))
         if len(kept) == count:

@@ -6,8 +6,8 @@ The pairs are views of one scene from two places, rooms that are nearly bare, on
 dealt out to two and cut, some of them flattened; three tenths are scans of two different scenes, where no pose is
 right. Many are thinned, noisy, or hold things that the other scan does not. Every pose that ``align`` would judge
 counts, so that the wrong ones are the plausible ones. No real scan is involved. Prints the weights for
-``fmr_cli/verdict.py``, and draws how often the poses of each confidence are right, on the half of the pairs that was
-not fitted.
+``fmr_cli/registration/confidence.py``, and draws how often the poses of each confidence are right, on the half of the
+pairs that was not fitted.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
+from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import RegistrationError
-from fmr_cli.geometry.voxels import cell_numbers
+from fmr_cli.geometry.pose_error import pose_error
+from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.registration import hypotheses
 from fmr_cli.registration.confidence import Judge
 from fmr_cli.registration.options import Options
@@ -97,7 +98,7 @@ def seen(points: np.ndarray, towards: np.ndarray) -> np.ndarray:
     """The points that hide each other least from a camera far away in the direction ``towards`` (3,)."""
     local = points @ Rotation.align_vectors([[0, 0, 1.0]], unit(towards)[None])[0].as_matrix().T
     cell = np.ptp(local, axis=0).max() / 50
-    column = cell_numbers(local * [1, 1, 0], cell)
+    column = np.unique(voxel_keys((local - local.min(0)) * [1, 1, 0], cell), return_inverse=True)[1]
     top = np.full(column.max() + 1, -np.inf)
     np.maximum.at(top, column, local[:, 2])
     return points[local[:, 2] > top[column] - 3 * cell]
@@ -149,9 +150,9 @@ def poses(seed: tuple[int, int]) -> list[tuple[np.ndarray, bool]]:
             judge.consider(refined(pair, hypothesis), hypothesis.start, hypothesis.errors)
     found = []
     for c in judge.candidates:
-        error = np.linalg.inv(truth) @ c.T_target_source
-        near = np.linalg.norm(error[:3, 3]) < RIGHT_EDGES * pair_edge(*prepared)
-        found.append((c.evidence.vector(), bool(together and near and angle_degrees(error) < RIGHT_DEGREES)))
+        degrees, shift = pose_error(c.T_target_source, truth)
+        near = shift < RIGHT_EDGES * pair_edge(*prepared) and degrees < RIGHT_DEGREES
+        found.append((c.evidence.vector(), bool(together and near)))
     return found
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.solver import make_template, solve
 from fmr_cli.geometry import se3
+from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.synthetic.batches import Pairs, cut, draw_clouds, make_pairs, random_motions
 
 SUCCESS = 5.0  # degrees
@@ -89,12 +90,10 @@ class Errors:
 
 def errors(estimate: Tensor, truth: Tensor) -> Errors:
     """Estimates against truths, both (B, 4, 4). NaN counts as half a turn."""
-    difference = torch.linalg.inv(truth.double()) @ estimate.double()
-    twist = se3.log(difference).nan_to_num(torch.pi)
-    rotation = torch.rad2deg(twist[:, :3].norm(dim=-1))
-    translation = difference[:, :3, 3].norm(dim=-1)
-    rmse = twist.square().mean(-1).sqrt()
-    return Errors(*(x.cpu().numpy() for x in (rotation, translation, rmse)))
+    found, true = (x.double().cpu().numpy() for x in (estimate, truth))
+    rotation, translation = pose_error(found, true)
+    twist = np.nan_to_num(se3.log(np.linalg.inv(true) @ found), nan=np.pi)
+    return Errors(np.nan_to_num(rotation, nan=180.0), translation, np.sqrt((twist**2).mean(-1)))
 
 
 def score(

@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor, nn
 
-WIDTHS = (1024, 512, 256)
+WIDTHS = (1024, 512, 256)  # units of the hidden layers: the paper's four layers with the output
 
 
 class Decoder(nn.Module):

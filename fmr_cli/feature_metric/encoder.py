@@ -7,17 +7,16 @@ batch normalisation: nothing to switch between training and use, and no cloud's 
 from __future__ import annotations
 
 import itertools
-import json
-from pathlib import Path
 from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.io.weights import read_weights
+from fmr_cli.feature_metric.inverse_compositional import chain, pose_jacobian
+from fmr_cli.feature_metric.layers import Layers
 
-HIDDEN = (64, 64, 64, 128)
-FEATURE_DIM = 1024
+HIDDEN = (64, 64, 64, 128)  # units of each layer: the paper's
+FEATURE_DIM = 1024  # channels K: the paper's
 
 
 class Encoder(nn.Module):
@@ -33,6 +32,23 @@ class Encoder(nn.Module):
     def linear(self) -> list[nn.Linear]:
         """The MLP's layers, by their type."""
         return [cast(nn.Linear, layer) for layer in self.layers]
+
+    @property
+    def weights(self) -> list[Tensor]:
+        """The layers' matrices (out, in)."""
+        return [layer.weight for layer in self.linear]
+
+    @classmethod
+    def of(cls, layers: Layers) -> Encoder:
+        """An encoder with the weights of ``layers``, which take no gradient."""
+        encoder = cls(len(layers[-1][1]), tuple(len(b) for _, b in layers[:-1]))
+        for layer, (W, b) in zip(encoder.linear, layers, strict=True):
+            layer.weight.data, layer.bias.data = torch.from_numpy(W), torch.from_numpy(b)
+        return encoder.eval().requires_grad_(False)
+
+    def arrays(self) -> Layers:
+        """The weights in numpy."""
+        return [(layer.weight.detach().cpu().numpy(), layer.bias.detach().cpu().numpy()) for layer in self.linear]
 
     def pointwise(self, points: Tensor) -> Tensor:
         """f of every point: (..., 3) -> (..., K). The last layer is linear, so that every channel keeps a gradient."""
@@ -67,7 +83,7 @@ class Encoder(nn.Module):
         Channel k goes back through the MLP from its own row of the last layer, at its own point.
         """
         x = points.gather(1, index[..., None].expand(-1, -1, 3))  # [B x K x 3]
-        return chain(self.linear, self.active(x))
+        return chain(self.weights, self.active(x))
 
     def active(self, x: Tensor) -> list[Tensor]:
         """Which units of each hidden layer are on at points (..., 3): a list of (..., width)."""
@@ -79,50 +95,7 @@ class Encoder(nn.Module):
         return on
 
 
-def chain(layers: list[nn.Linear], on: list[Tensor]) -> Tensor:
-    """Rows of the product W_n D_(n-1) W_(n-1) ... D_1 W_1, D the layers' 0/1 masks ``on`` (B, K, width): (B, K, 3).
-
-    Row k of the last matrix goes with the masks of channel k's own point.
-    """
-    row: Tensor = layers[-1].weight  # [K x width]
-    for layer, mask in zip(reversed(layers[:-1]), reversed(on), strict=True):
-        row = (row * mask) @ layer.weight
-    return row
-
-
 def jacobian(encoder: Encoder, points: Tensor, index: Tensor) -> Tensor:
-    """J of F(exp(-xi) P) at xi = 0, exact, from the critical points: (B, N, 3), (B, K) -> (B, K, 6).
-
-    F_k depends on the one point p that sets channel k, and d(exp(-xi) p) = -(omega × p + v), so that by the chain rule
-    J_k = -(p × grad f_k, grad f_k).
-    """
-    gradient = encoder.critical_gradients(points, index)
+    """J of F(exp(-xi) P) at xi = 0, exact, from the critical points: (B, N, 3), (B, K) -> (B, K, 6)."""
     p = points.gather(1, index[..., None].expand(-1, -1, 3))
-    return -torch.cat([torch.linalg.cross(p, gradient), gradient], -1)
-
-
-def save_encoder(path: Path | str, encoder: Encoder, decoder: nn.Module | None = None) -> None:
-    """Write the weights as safetensors, the architecture in its metadata; a decoder's go along for further training."""
-    from safetensors.torch import save_file
-
-    tensors = {f"encoder.{k}": v.detach().cpu().contiguous() for k, v in encoder.state_dict().items()}
-    if decoder is not None:
-        tensors |= {f"decoder.{k}": v.detach().cpu().contiguous() for k, v in decoder.state_dict().items()}
-    architecture = {"hidden": list(encoder.hidden), "feature_dim": encoder.feature_dim}
-    save_file(tensors, str(path), metadata={"architecture": json.dumps(architecture)})
-
-
-def load_encoder(path: Path | str) -> Encoder:
-    """Read an encoder written by ``save_encoder``. Raises ModelError where the file is missing or does not fit."""
-    encoder, _ = load_weights(path)
-    return encoder
-
-
-def load_weights(path: Path | str) -> tuple[Encoder, dict[str, Tensor]]:
-    """The encoder and the decoder's tensors (empty where the file holds none)."""
-    weights = read_weights(path)
-    encoder = Encoder(weights.feature_dim, weights.hidden)
-    for layer, (W, b) in zip(encoder.linear, weights.layers, strict=True):
-        layer.weight.data, layer.bias.data = torch.from_numpy(W), torch.from_numpy(b)
-    decoder = {name: torch.from_numpy(array) for name, array in weights.decoder.items()}
-    return encoder.eval().requires_grad_(False), decoder
+    return pose_jacobian(p, encoder.critical_gradients(points, index))

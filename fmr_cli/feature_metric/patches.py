@@ -17,14 +17,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fmr_cli.feature_metric.fast import capped, chain, constrained_step
-from fmr_cli.feature_metric.layers import Layers
-from fmr_cli.geometry.motion import exp
+from fmr_cli.feature_metric.inverse_compositional import capped, chain, constrained_step, pose_jacobian
+from fmr_cli.feature_metric.layers import Layers, hidden
+from fmr_cli.geometry.kernels import geman_mcclure
+from fmr_cli.geometry.se3 import exp
 
 LAYERS = 3  # of the encoder: 64-64-64
 MIN_SHARE = 0.35  # of the target's points a ball must hold of the source
 SCALE_FROM, SCALE_TO = 3.0, 1.0  # the robust scale's factor over the iterations, times the median residual
-MAX_STEP = 0.5
+MAX_STEP = 0.5  # rad, and units of the normalised cloud: patches see less far than the whole
 CHUNK = 16  # balls encoded at once: their activations stay in the processor's cache
 
 # (centres (P, 3)) -> offsets (P, n, 3) in radii, valid (P, n), float32: how the points lie in the balls
@@ -76,19 +77,16 @@ def patch_template(layers: Layers, centres: np.ndarray, look: Neighbourhoods, ra
     index = values.argmax(1)  # [P x C], the critical points
     feature = np.take_along_axis(values, index[:, None], 1)[:, 0]
     u = np.take_along_axis(offsets, index[..., None], 1)  # [P x C x 3]
-    on, x = [], u
-    for weight, bias in layers[: LAYERS - 1]:
-        x = x @ weight.T + bias
-        on.append(x > 0)
-        x = np.maximum(x, 0)
+    x, on = hidden(layers[:LAYERS], u)
     weight, bias = layers[LAYERS - 1]
     value = (x * weight).sum(-1) + bias
-    slope = chain(layers[:LAYERS], on)  # df/du before the last ReLU, which is on wherever the feature is above 0
+    # df/du before the last ReLU, which is on wherever the feature is above 0
+    slope = chain([W for W, _ in layers[:LAYERS]], on)
     # d[(1 - |u|²) f(u)]/du = (1 - |u|²) df/du - 2 u f
     window = 1 - (u * u).sum(-1, keepdims=True)
     gradient = (window * slope - 2 * u * value[..., None]) / radius
     p = centres[:, None] + radius * u
-    J = -np.concatenate([np.cross(p, gradient), gradient], -1) * (feature > 0)[..., None]
+    J = pose_jacobian(p, gradient) * (feature > 0)[..., None]
     return PatchTemplate(centres, feature, J, np.swapaxes(J, 1, 2) @ J, valid.sum(1))
 
 
@@ -114,7 +112,7 @@ def refine(
             return PatchFit(g, np.full_like(error, np.nan), np.zeros_like(error))
         fall = SCALE_FROM + (SCALE_TO - SCALE_FROM) * min(iteration / max(iterations - 1, 1), 1.0)
         s2 = max((fall * np.median(error[occupied])) ** 2, 1e-12)
-        weight = (s2 / (s2 + error**2)) ** 2 * occupied
+        weight = geman_mcclure(error**2, s2) * occupied
         if iteration < iterations:
             A = np.tensordot(weight, template.JtJ, 1)
             b = weight @ (r[:, None] @ template.J)[:, 0]

@@ -11,32 +11,31 @@ from typing import Protocol
 
 import numpy as np
 
-from fmr_cli.feature_metric.fast import Solution, Template
-from fmr_cli.geometry.motion import rotation_between
+from fmr_cli.feature_metric.inverse_compositional import Solution, Template
+from fmr_cli.geometry.pose_error import angle_between
 
 # 64 rotations leave none further than 60.4 deg from a start (30 on average); the solver's basin, measured, reaches 60.
 STARTS = 64
 # (points, iterations, distinct poses kept) of each round; the last takes all points.
 ROUNDS = ((128, 4, 16), (256, 5, 6), (None, 10, 6))
-KEPT = ROUNDS[-1][2]
 APART = math.radians(10.0)  # poses nearer than this are one
 
 
 class Solver(Protocol):
-    """What solves from given starts: ``fast.FastEncoder``, or ``solver.OnDevice`` on a GPU."""
+    """What solves from given starts: ``numpy_solver.NumpySolver``, or ``solver.OnDevice`` on a GPU."""
 
-    def template(self, target: np.ndarray, threads: int = 1) -> Template: ...
+    def template(self, target: np.ndarray, threads: int = 1) -> Template[np.ndarray]: ...
 
     def solve(
         self,
-        template: Template,
+        template: Template[np.ndarray],
         source: np.ndarray,
         g: np.ndarray,
         iterations: int = 10,
         robust: bool = True,
         basis: np.ndarray | None = None,
         threads: int = 1,
-    ) -> Solution: ...
+    ) -> Solution[np.ndarray]: ...
 
 
 @dataclass
@@ -74,7 +73,7 @@ def distinct(g: np.ndarray, error: np.ndarray, count: int) -> list[int]:
     """Indices of the ``count`` poses of least error, no two within APART of each other."""
     kept: list[int] = []
     for i in np.argsort(error, kind="stable").tolist():
-        if all(rotation_between(g[i, :3, :3], g[j, :3, :3]) > APART for j in kept):
+        if all(angle_between(g[i, :3, :3], g[j, :3, :3]) > APART for j in kept):
             kept.append(i)
         if len(kept) == count:
             break

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-COVARIANCE_NEIGHBOURS = 10
+COVARIANCE_NEIGHBOURS = 10  # points: small_gicp's own default
 
 
 class GicpCloud:

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fmr_cli.geometry.dof import Dof
+from fmr_cli.geometry.se3 import exp
 
-TURNS = 24  # starts about one axis: 15 deg apart
-SMALL = 1e-4  # of a squared angle: below it the series are exact to float64 rounding
+TURNS = 24  # starts about one axis: 15 deg apart, a quarter of what the solver reaches (see search.STARTS)
 
 
 @dataclass(frozen=True)
@@ -86,27 +86,6 @@ class Motion:
         return T
 
 
-def exp(xi: np.ndarray) -> np.ndarray:
-    """Twists (..., 6), rotation first, to (..., 4, 4): R = I + A w^ + B w^², t = (I + B w^ + C w^²) v."""
-    omega, v = xi[..., :3], xi[..., 3:]
-    t = (omega * omega).sum(-1)[..., None, None]
-    small = t < SMALL
-    safe = np.where(small, 1.0, t)
-    a = np.sqrt(safe)
-    A = np.where(small, 1 - t / 6 + t**2 / 120, np.sin(a) / a)
-    B = np.where(small, 0.5 - t / 24 + t**2 / 720, 2 * (np.sin(a / 2) / a) ** 2)
-    C = np.where(small, 1 / 6 - t / 120 + t**2 / 5040, (a - np.sin(a)) / (safe * a))
-    W = np.zeros((*xi.shape[:-1], 3, 3))
-    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -omega[..., 2], omega[..., 1], -omega[..., 0]
-    W -= np.swapaxes(W, -1, -2)
-    W2 = W @ W
-    T = np.zeros((*xi.shape[:-1], 4, 4))
-    T[..., :3, :3] = np.eye(3) + A * W + B * W2
-    T[..., :3, 3] = ((np.eye(3) + B * W + C * W2) @ v[..., None])[..., 0]
-    T[..., 3, 3] = 1
-    return T
-
-
 def rotations(count: int) -> np.ndarray:
     """(count, 4, 4) rotations spread evenly over SO(3): the super-Fibonacci spiral (Alexa, CVPR 2022)."""
     phi, psi = math.sqrt(2), 1.533751168755204288118041
@@ -117,8 +96,3 @@ def rotations(count: int) -> np.ndarray:
     q = [r * np.cos(d / phi), R * np.sin(d / psi), R * np.cos(d / psi), r * np.sin(d / phi)]
     T[:, :3, :3] = Rotation.from_quat(np.stack(q, -1)).as_matrix()
     return T
-
-
-def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The angle in radians between rotations (..., 3, 3), batch dimensions broadcast."""
-    return np.arccos(np.clip(((a * b).sum((-1, -2)) - 1) / 2, -1, 1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-NORMAL_NEIGHBOURS = 16
+NORMAL_NEIGHBOURS = 16  # points, about two rings on a surface of one point a voxel
 CLOSE = 1e-2  # of the squared spread of eigenvalues: the closed form's rounding then shows in the eigenvector
 
 

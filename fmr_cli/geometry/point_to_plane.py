@@ -1,7 +1,7 @@
-"""The last geometric step: from a pose that is right to one that is exact, and what the scans say about its certainty.
+"""Point-to-plane: the distances of points from the planes of their partners, linearised about a pose.
 
-Rigid motions are polished by small_gicp. Constrained motions and scale, which it does not offer, take a point-to-plane
-iteration of the same form; its normal equations at the end also give the information matrix of every result.
+Constrained motions and scale, which small_gicp's polish does not offer, are iterated here; the same normal equations
+give the information matrix of every result, and the sequences' local map solves by them.
 """
 
 from __future__ import annotations
@@ -10,16 +10,53 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
+from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.kernels import geman_mcclure
 from fmr_cli.geometry.normals import neighbours, normals_and_variation
+from fmr_cli.geometry.se3 import exp
 
-ITERATIONS = 30
+ITERATIONS = 30  # at most; from a refined pose it converges in about ten
+SCALE = 3.0  # medians of |r|: the robust kernel's scale, 2 sigma of normal residuals
+STILL = 1e-9  # rad, and voxel edges: a step below it is rounding
+
+
+def linearise(
+    x: np.ndarray, y: np.ndarray, n: np.ndarray, pivot: np.ndarray, scale: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """r = n·(x - y), (N,), and its derivative by the step (omega, v[, log s]) of ``step_motion``, (6 or 7, N).
+
+    x: moved points, y: points on the planes, n: unit normals, all (N, 3); pivot (3,): what the step turns about.
+    A row a parameter, so that each is one contiguous pass.
+    """
+    (a, b, c), (nx, ny, nz) = (x - pivot).T, n.T
+    rows = [b * nz - c * ny, c * nx - a * nz, a * ny - b * nx, nx, ny, nz]
+    if scale:
+        rows.append(a * nx + b * ny + c * nz)
+    return np.einsum("ni,ni->n", n, x - y), np.stack(rows)
+
+
+def normal_equations(J: np.ndarray, r: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A = Σ w J Jᵀ and b = Σ w J r of ``linearise``: J (d, N), r and weight (N,) -> (d, d), (d,)."""
+    return (J * weight) @ J.T, J @ (weight * r)
+
+
+def step_motion(step: np.ndarray, pivot: np.ndarray | None = None) -> np.ndarray:
+    """The motion (4, 4) of a step (omega, v[, log s]): x -> s R (x - pivot) + pivot + v, pivot the origin by default.
+
+    To first order that of the twist (omega, v), and the same subgroup; v stays the pivot's shift however far it turns.
+    """
+    pivot = np.zeros(3) if pivot is None else pivot
+    M = exp(np.concatenate([step[:3], np.zeros(3)]))
+    if len(step) == 7:
+        M[:3, :3] *= np.exp(step[6])
+    M[:3, 3] = pivot + step[3:6] - M[:3, :3] @ pivot
+    return M
 
 
 @dataclass
 class Normal:
-    """The normal equations of point-to-plane at a pose: A = Σ w JᵀJ and b = Σ w Jᵀr over the twist (omega, v[, log s]).
+    """The normal equations of point-to-plane at a pose: A = Σ w JᵀJ and b = Σ w Jᵀr over the step (omega, v, log s).
 
     variance: of the weighted residuals, own unit squared. count: correspondences.
     """
@@ -39,17 +76,14 @@ def point_to_plane(
     reach: float,
     pivot: np.ndarray,
 ) -> Normal:
-    """Linearise n·(T x - y) over nearest neighbours within reach; the twist turns (and scales) about ``pivot`` (3,)."""
-    moved = source @ T[:3, :3].T + T[:3, 3]
+    """Linearise n·(T x - y) over nearest neighbours within reach; the step turns (and scales) about ``pivot`` (3,)."""
+    moved = transform_points(T, source)
     distance, match = tree.query(moved, distance_upper_bound=reach)
     here = np.isfinite(distance)
-    x, y, n = moved[here], target[match[here]], normals[match[here]]
-    r = np.einsum("ni,ni->n", n, x - y)
-    J = np.hstack([np.cross(x - pivot, n), n, np.einsum("ni,ni->n", n, x - pivot)[:, None]])
-    s2 = (3 * np.median(np.abs(r))) ** 2 + 1e-24 * reach**2 if len(r) else 1.0
-    w = (s2 / (s2 + r * r)) ** 2
-    A = J.T @ (w[:, None] * J)
-    return Normal(A, J.T @ (w * r), float((w * r * r).sum() / max(w.sum(), 1e-12)), len(r))
+    r, J = linearise(moved[here], target[match[here]], normals[match[here]], pivot, scale=True)
+    s2 = (SCALE * np.median(np.abs(r))) ** 2 + 1e-24 * reach**2 if len(r) else 1.0  # copies fit to rounding
+    w = geman_mcclure(r * r, s2)
+    return Normal(*normal_equations(J, r, w), float((w * r * r).sum() / max(w.sum(), 1e-12)), len(r))
 
 
 def constrained(
@@ -70,15 +104,7 @@ def constrained(
         if normal.count < 6:
             return T
         step = -B @ np.linalg.lstsq(B.T @ normal.A @ B, B.T @ normal.b, rcond=1e-12)[0]
-        g = _about(pivot, step) @ g
-        if np.abs(step[:3]).max() < 1e-9 and np.abs(step[3:6]).max() < 1e-9 * edge:
+        g = step_motion(step, pivot) @ g
+        if np.abs(step[:3]).max() < STILL and np.abs(step[3:6]).max() < STILL * edge:
             break
     return g
-
-
-def _about(pivot: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """The motion of a step (omega, v, log s) about pivot as 4x4: x -> s R (x - pivot) + pivot + v."""
-    M = np.eye(4)
-    M[:3, :3] = np.exp(step[6]) * Rotation.from_rotvec(step[:3]).as_matrix()
-    M[:3, 3] = pivot + step[3:6] - M[:3, :3] @ pivot
-    return M

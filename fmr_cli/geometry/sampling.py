@@ -10,15 +10,29 @@ from fmr_cli.geometry.voxels import occupied_voxels
 WORKING_VOXELS = 5000  # the voxel edge is chosen so that about so many are occupied
 SAMPLE = 15_000  # points that the choice of the voxel edge looks at
 SPACING_SAMPLE = 1_000  # of them, whose nearest neighbour is looked up
-SCALE_ROUNDS, SCALE_TOLERANCE = 20, 0.02
+SCALE_ROUNDS, SCALE_TOLERANCE = 20, 0.02  # rounds at most; share of the wanted voxels that may be too many
+OBLIQUE = 0.5377, 0.3183, 0.7809  # a line that no usual grid is square to
 
 
 def distinct(points: np.ndarray) -> np.ndarray:
-    """The points without exact repetitions: (N, 3) -> (M, 3), M <= N.
+    """The points without exact repetitions, of each the first: (N, 3) -> (M, 3), M <= N.
 
-    Sorted by their distance along one oblique line, which differs for all points that differ (but by a rare chance).
+    Sorted by their distance along one oblique line, where equal points meet. Different points may meet too, as on a
+    grid: they are told apart by their coordinates. np.unique of whole rows takes two to five times as long (measured on
+    a million points).
     """
-    return points[np.unique(points @ [0.5377, 0.3183, 0.7809], return_index=True)[1]]
+    x, y, z = points.T
+    along = x * OBLIQUE[0] + y * OBLIQUE[1] + z * OBLIQUE[2]  # term by term: equal points to equal bits
+    order = np.argsort(along, kind="stable")
+    same = np.diff(along[order]) == 0
+    differ = (np.diff(points[order], axis=0) != 0).any(1)
+    if (same & differ).any():
+        run = np.concatenate([[0], np.cumsum(~same)])  # of points that meet
+        mixed = np.isin(run, run[1:][same & differ])
+        some = order[mixed]
+        order[mixed] = some[np.lexsort((some, *points[some].T, run[mixed]))]
+        differ = (np.diff(points[order], axis=0) != 0).any(1)
+    return points[order[np.concatenate([[True], ~same | differ])[: len(points)]]]
 
 
 def thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

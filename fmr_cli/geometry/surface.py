@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fmr_cli.geometry.normals import neighbours, normals_and_variation
-from fmr_cli.geometry.voxels import cell_numbers, voxel_downsample
+from fmr_cli.geometry.voxels import voxel_downsample, voxel_keys
 
-BORDER = 1e-3  # surface variation that a lean of 1 counts as
+BORDER = 1e-3  # surface variation that a lean of 1 counts as: below any bend, above the rounding of a plane
 SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
 
 
@@ -59,11 +59,11 @@ class Surface:
         """
         _, variation, reach, lean = self._shape
         order = np.argsort(-np.where(reach < SPARSE * self.edge, variation + BORDER * lean, 0.0), kind="stable")
-        first = np.unique(cell_numbers(self.points[order], 2 * self.edge), return_index=True)[1]
+        first = np.unique(voxel_keys((self.points - self.points.min(0))[order], 2 * self.edge), return_index=True)[1]
         return order[np.sort(first)[:count]]
 
     def patches(self, index: np.ndarray, radius: float, neighbours: int) -> dict[str, np.ndarray]:
-        """The neighbourhoods of points ``index`` (K,): what ``feature_metric.local.describe_patches`` takes, float32.
+        """The neighbourhoods of points ``index`` (K,): what ``patch_encoder.describe_patches`` takes, float32.
 
         radius: in voxel edges. Offsets are in radii, nearest first; what a row lacks of ``neighbours`` is not valid.
         """

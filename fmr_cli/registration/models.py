@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Literal
 
 from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.errors import ModelError
-from fmr_cli.feature_metric.fast import FastEncoder
+from fmr_cli.feature_metric.numpy_solver import NumpySolver
 from fmr_cli.feature_metric.search import Solver
+from fmr_cli.io.weights import read_weights
 
 if TYPE_CHECKING:
     import torch
@@ -35,11 +36,16 @@ def pick_device(device: Device = "auto") -> torch.device:
     return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def load_encoder(path: Path | str) -> Encoder:
+    """The encoder of a .safetensors file, as torch has it, on the CPU. Raises ModelError: missing, or does not fit."""
+    from fmr_cli.feature_metric.encoder import Encoder
+
+    return Encoder.of(read_weights(path).layers)
+
+
 @lru_cache(maxsize=4)
 def encoder(model: Path | None = None, device: Device = "auto") -> Encoder:
     """The encoder of a .safetensors file, or the bundled one, as torch has it, loaded once. Raises ModelError."""
-    from fmr_cli.feature_metric.encoder import load_encoder
-
     place = pick_device(device)
     if model is not None:
         return load_encoder(model).to(place)
@@ -48,12 +54,12 @@ def encoder(model: Path | None = None, device: Device = "auto") -> Encoder:
 
 
 @lru_cache(maxsize=4)
-def fast_encoder(model: Path | None = None) -> FastEncoder:
+def fast_encoder(model: Path | None = None) -> NumpySolver:
     """The encoder of a .safetensors file, or the bundled one, without torch, loaded once. Raises ModelError."""
     if model is not None:
-        return FastEncoder.load(model)
+        return NumpySolver(read_weights(model).layers)
     with bundled_path() as path:
-        return FastEncoder.load(path)
+        return NumpySolver(read_weights(path).layers)
 
 
 def solver(model: Path | None = None, device: Device = "auto") -> Solver:

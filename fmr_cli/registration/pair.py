@@ -14,7 +14,7 @@ import numpy as np
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.descriptors.matching import match
 from fmr_cli.errors import FmrError, RegistrationError
-from fmr_cli.feature_metric.fast import Template
+from fmr_cli.feature_metric.inverse_compositional import Template
 from fmr_cli.geometry.frames import Frame, enter_frames, leave_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.sampling import sample

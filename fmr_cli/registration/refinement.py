@@ -9,12 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.feature_metric.fast import constrained_step
+from fmr_cli.feature_metric.inverse_compositional import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.geometry.gicp import GicpCloud, gicp
-from fmr_cli.geometry.motion import exp
 from fmr_cli.geometry.point_to_plane import constrained, point_to_plane
 from fmr_cli.geometry.sampling import sample
+from fmr_cli.geometry.se3 import exp
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.pair import RANKING_POINTS, Pair

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
+from fmr_cli.geometry.voxels import voxel_keys
 
 
 class GrowingMap:
@@ -12,14 +13,13 @@ class GrowingMap:
 
     def __init__(self, voxel: float) -> None:
         self.voxel = voxel
-        self.keys = np.zeros(0, np.dtype("i8, i8, i8"))  # of the voxels taken, sorted
+        self.keys = np.zeros(0, np.int64)  # of the voxels taken, sorted
         self.parts: list[PointCloud] = []
 
     def add(self, cloud: PointCloud, pose: np.ndarray, frame: int) -> None:
         """Add the points of a scan that lie where nothing is yet; pose (4, 4) takes it to the map's frame."""
         moved = cloud.transformed(pose)
-        cells = np.floor(moved.points / self.voxel).astype(np.int64)
-        keys, first = np.unique(cells.view(self.keys.dtype).ravel(), return_index=True)
+        keys, first = np.unique(voxel_keys(moved.points, self.voxel), return_index=True)
         place = np.searchsorted(self.keys, keys)
         known = np.zeros(len(keys), bool)
         inside = place < len(self.keys)

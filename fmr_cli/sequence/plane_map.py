@@ -10,6 +10,9 @@ import numpy as np
 import small_gicp
 
 from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.kernels import geman_mcclure
+from fmr_cli.geometry.point_to_plane import linearise, normal_equations, step_motion
+from fmr_cli.geometry.voxels import voxel_keys
 
 REACH = 1.5  # a point's plane is sought within
 FLAT = 0.8  # length of the mean normal, below which a voxel holds no plane
@@ -20,7 +23,6 @@ KERNEL = 3.0  # residuals beyond so many sigma weigh little (Geman-McClure)
 MIN_SIGMA = 0.01
 MIN_SPREAD = 0.3  # of log range, to tell how residuals grow with it
 BANDS = 8  # of equal count by range from the sensor
-BITS = 21  # of a voxel's index along an axis
 
 
 class PlaneMap:
@@ -34,8 +36,7 @@ class PlaneMap:
     def insert(self, points: np.ndarray, normals: np.ndarray, T: np.ndarray) -> None:
         """Add a scan's points and unit normals (N, 3), moved by T."""
         moved = transform_points(T, points)
-        cells = np.clip(np.floor(moved).astype(np.int64) + (1 << (BITS - 1)), 0, (1 << BITS) - 1)
-        keys, inverse = np.unique((cells[:, 0] << 2 * BITS) | (cells[:, 1] << BITS) | cells[:, 2], return_inverse=True)
+        keys, inverse = np.unique(voxel_keys(moved, 1.0), return_inverse=True)
         values = np.concatenate([np.ones((len(points), 1)), moved, normals @ T[:3, :3].T], 1)
         sums = np.stack([np.bincount(inverse, column, len(keys)) for column in values.T], 1)
         place = np.searchsorted(self.keys, keys)
@@ -74,16 +75,14 @@ class PlaneMap:
             p, n, offset, b = points[on], self.normals[plane[on]], self.means[plane[on]], band[on]
             for again in range(STEPS):
                 moved = transform_points(T, p)
-                r = np.einsum("ij,ij->i", n, moved - offset)
+                r, J = linearise(moved, offset, n, np.zeros(3))
                 if again == 0:
                     sigma = scale_by_band(np.abs(r), b)
-                    worth, kernel = trust(sigma, slope)[b], 1 / (KERNEL * sigma[b])
-                weight = worth / (1 + (r * kernel) ** 2) ** 2
-                x, y, z = moved.T
-                J = np.stack([y * n[:, 2] - z * n[:, 1], z * n[:, 0] - x * n[:, 2], x * n[:, 1] - y * n[:, 0], *n.T])
-                H = (J * weight) @ J.T
-                step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -J @ (weight * r))
-                T = exponential(step) @ T
+                    worth, scale2 = trust(sigma, slope)[b], (KERNEL * sigma[b]) ** 2
+                weight = worth * geman_mcclure(r * r, scale2)
+                H, gradient = normal_equations(J, r, weight)
+                step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -gradient)
+                T = step_motion(step) @ T
                 first = step if again == 0 else first
             if (np.abs(first) < STILL).all():
                 break
@@ -107,13 +106,3 @@ def trust(sigma: np.ndarray, slope: float) -> np.ndarray:
     average out, so there the near points decide.
     """
     return (sigma.min() / sigma) ** (4 * np.clip(2 * slope - 2, 0, 1))
-
-
-def exponential(step: np.ndarray) -> np.ndarray:
-    """The (4, 4) motion of a small rotation vector and a shift (6,); the rotation is exact."""
-    w, angle = step[:3], float(np.linalg.norm(step[:3]))
-    K = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-    T = np.eye(4)
-    T[:3, :3] += np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K
-    T[:3, 3] = step[3:]
-    return T

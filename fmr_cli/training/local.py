@@ -31,7 +31,7 @@ APART = 3.0  # voxel edges: nearer places are not each other's negatives
 
 
 class LocalNet(nn.Module):
-    """``feature_metric.local.LocalEncoder`` as it is trained: (K, PATCH_POINTS, CHANNELS) -> (K, 32), unit length."""
+    """``patch_encoder.LocalEncoder`` as it is trained: (K, PATCH_POINTS, CHANNELS) -> (K, 32), unit length."""
 
     def __init__(self, point: tuple[int, ...] = (64, 128, 128), head: tuple[int, ...] = (128, 32)) -> None:
         super().__init__()

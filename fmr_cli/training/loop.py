@@ -25,7 +25,7 @@ from torch import Tensor
 from fmr_cli.errors import FmrError, ModelError
 from fmr_cli.evaluation.heldout import HARD, score
 from fmr_cli.feature_metric.decoder import Decoder, chamfer
-from fmr_cli.feature_metric.encoder import Encoder, load_weights, save_encoder
+from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.io.files import atomic_write
 from fmr_cli.synthetic.batches import (
     Augment,
@@ -38,6 +38,7 @@ from fmr_cli.synthetic.batches import (
 )
 from fmr_cli.training.losses import anchor_loss, draw_anchors, encode, pose_loss
 from fmr_cli.training.recipe import Recipe, read_recipe
+from fmr_cli.training.weights import load_weights, save_encoder
 
 RAMP = 100  # steps over which the learning rate rises from zero
 LAST_RATE = 0.01  # of the learning rate, where its cosine ends

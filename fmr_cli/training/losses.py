@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fmr_cli.feature_metric.decoder import Decoder, chamfer
-from fmr_cli.feature_metric.encoder import Encoder, chain
-from fmr_cli.feature_metric.solver import robust_weight
+from fmr_cli.feature_metric.encoder import Encoder
+from fmr_cli.feature_metric.inverse_compositional import MAX_STEP, capped, chain, pose_jacobian, robust_weight
 from fmr_cli.geometry import se3
 from fmr_cli.synthetic.batches import random_directions
 
@@ -74,9 +73,7 @@ def encode(encoder: Encoder, points: Tensor) -> Code:
 def jacobian(encoder: Encoder, code: Code) -> Tensor:
     """J of F(exp(-xi) P) at xi = 0 with a gradient, (B, K, 6), as ``encoder.jacobian``."""
     on = [torch.nn.functional.embedding(code.at, mask.float()) for mask in encoder.active(code.points)]
-    gradient = chain(encoder.linear, on)
-    p = code.points[code.at]
-    return -torch.cat([torch.linalg.cross(p, gradient), gradient], -1)
+    return pose_jacobian(code.points[code.at], chain(encoder.weights, on))
 
 
 def draw_anchors(count: int, generator: torch.Generator) -> Tensor:
@@ -96,11 +93,6 @@ def anchor_loss(encoder: Encoder, anchors: Tensor, width: float, count: int, gen
     points = radius * random_directions(count, generator)
     wanted = 1 / (1 + torch.cdist(points, anchors).square() / width**2)
     return (encoder.pointwise(points) - wanted).square().mean()
-
-
-def autoencoder_loss(encoder: Encoder, decoder: Decoder, points: Tensor, whole: Tensor) -> Tensor:
-    """Chamfer distance of what the decoder makes of F(points) to ``whole``, another sample of the same surface."""
-    return chamfer(decoder(encode(encoder, points).feature), whole).mean()
 
 
 def pose_loss(
@@ -127,8 +119,7 @@ def pose_loss(
         A, b = J.mT @ WJ, WJ.mT @ r[..., None]
         damping = DAMPING * A.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * torch.eye(6, device=A.device)
         step = torch.linalg.solve(A + damping + 1e-12 * torch.eye(6, device=A.device), b)[..., 0]
-        step = step / step.norm(dim=-1, keepdim=True).clamp_min(1.0)  # the solver's cap of one radian
-        g = se3.exp(step) @ g
+        g = se3.exp(capped(step, MAX_STEP)) @ g
         distance = (se3.transform(g, source) - wanted).square().sum(-1).mean(-1).clamp_min(1e-12).sqrt()
         loss = loss + (iteration + 1) * torch.log1p(distance / NEAR).mean()
     return 2 * loss / (iterations * (iterations + 1))
@@ -137,4 +128,4 @@ def pose_loss(
 @torch.no_grad()
 def constant_weight(J: Tensor, r: Tensor) -> Tensor:
     """``robust_weight`` without a gradient; of what is not finite, any: the loss says so."""
-    return robust_weight(J.double().nan_to_num(), r.nan_to_num()).to(r.dtype)
+    return robust_weight(J.double().nan_to_num(), r.double().nan_to_num()).to(r.dtype)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from fmr_cli.cli.app import main
+from fmr_cli.geometry.pose_error import pose_error as error_of_pose
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 
@@ -59,10 +60,4 @@ def truth() -> np.ndarray:
 @pytest.fixture(scope="session")
 def pose_error() -> Callable[[np.ndarray, np.ndarray], tuple[float, float]]:
     """Degrees and length between two poses."""
-
-    def error(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-        D = np.linalg.inv(truth) @ T
-        sine = np.linalg.norm([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
-        return float(np.degrees(np.arctan2(sine, np.trace(D[:3, :3]) - 1))), float(np.linalg.norm(D[:3, 3]))
-
-    return error
+    return error_of_pose

@@ -7,7 +7,9 @@ import numpy as np
 from fmr_cli.cloud import transform_points
 from fmr_cli.descriptors.consensus import consensus
 from fmr_cli.descriptors.matching import match
-from fmr_cli.geometry.motion import Motion, exp, rotation_between
+from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.pose_error import angle_between
+from fmr_cli.geometry.se3 import exp
 
 TOLERANCE = 0.1
 
@@ -28,7 +30,7 @@ def pose(omega: tuple[float, float, float]) -> np.ndarray:
 def test_the_pose_is_found_among_80_percent_of_wrong_matches() -> None:
     T = pose((1.0, -2.0, 0.4))
     found, inliers = consensus(*matches(0.8, T), TOLERANCE, 5, Motion())
-    assert rotation_between(found[0, :3, :3], T[:3, :3]) < 0.02
+    assert angle_between(found[0, :3, :3], T[:3, :3]) < 0.02
     assert np.linalg.norm(found[0, :3, 3] - T[:3, 3]) < 0.05
     assert 55 <= inliers[0] <= 70
     assert (np.diff(inliers) <= 0).all()
@@ -44,14 +46,14 @@ def test_two_motions_give_two_poses() -> None:
     x, y = matches(0.0, a, 40)
     u, v = matches(0.0, b, 15)
     found, inliers = consensus(np.concatenate([x, u]), np.concatenate([y, v]), TOLERANCE, 5, Motion())
-    assert rotation_between(found[0, :3, :3], a[:3, :3]) < 0.02
-    assert rotation_between(found[1, :3, :3], b[:3, :3]) < 0.02
+    assert angle_between(found[0, :3, :3], a[:3, :3]) < 0.02
+    assert angle_between(found[1, :3, :3], b[:3, :3]) < 0.02
     assert inliers[:2].tolist() == [40, 15]
 
 
 def test_a_constraint_holds_in_every_pose() -> None:
     found, _ = consensus(*matches(0.8, pose((0.0, 0.0, 2.5))), TOLERANCE, 5, Motion("yaw"))
-    assert rotation_between(found[0, :3, :3], pose((0.0, 0.0, 2.5))[:3, :3]) < 0.02
+    assert angle_between(found[0, :3, :3], pose((0.0, 0.0, 2.5))[:3, :3]) < 0.02
     assert (found[:, :3, 2] == [0, 0, 1]).all()
 
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from fmr_cli.feature_metric.encoder import Encoder
-from fmr_cli.feature_metric.fast import FastEncoder
-from fmr_cli.registration.models import bundled_encoder, bundled_path
+from fmr_cli.feature_metric.numpy_solver import NumpySolver
+from fmr_cli.registration.models import bundled_encoder, fast_encoder
 from fmr_cli.synthetic.shapes import shapes
 
 
@@ -34,10 +34,9 @@ def bodies() -> Tensor:
 
 
 @pytest.fixture(scope="session")
-def fast() -> FastEncoder:
+def fast() -> NumpySolver:
     """The bundled encoder without torch."""
-    with bundled_path() as path:
-        return FastEncoder.load(path)
+    return fast_encoder()
 
 
 @pytest.fixture(scope="session")

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from torch import Tensor
 
-from fmr_cli.errors import ModelError
-from fmr_cli.feature_metric.decoder import Decoder
-from fmr_cli.feature_metric.encoder import Encoder, jacobian, load_encoder, load_weights, save_encoder
+from fmr_cli.feature_metric.encoder import Encoder, jacobian
 from fmr_cli.feature_metric.solver import FINITE_STEP, finite_jacobian
 from fmr_cli.geometry import se3
 
@@ -67,26 +63,3 @@ def test_finite_differences_tend_to_the_jacobian(exact_encoder: Encoder, bodies:
     assert off[1] < off[0] / 2
     assert off[2] < off[1] / 2
     assert off[3] < 1e-5
-
-
-def test_weights_go_to_a_file_and_back(tmp_path: Path, bodies: Tensor) -> None:
-    torch.manual_seed(0)
-    encoder, decoder = Encoder(96, (16, 32)), Decoder(96, 50)
-    save_encoder(tmp_path / "e.safetensors", encoder, decoder)
-    again, tensors = load_weights(tmp_path / "e.safetensors")
-    assert torch.equal(again(bodies), encoder(bodies))
-    decoder.load_state_dict(tensors)
-    assert not any(p.requires_grad for p in again.parameters())
-
-
-def test_files_that_hold_no_encoder_are_named(tmp_path: Path) -> None:
-    from safetensors.torch import save_file
-
-    with pytest.raises(ModelError, match=r"none\.safetensors: no such model file"):
-        load_encoder(tmp_path / "none.safetensors")
-    (tmp_path / "text.safetensors").write_text("not weights")
-    with pytest.raises(ModelError, match=r"text\.safetensors: not a safetensors file"):
-        load_encoder(tmp_path / "text.safetensors")
-    save_file({"a": torch.zeros(3)}, str(tmp_path / "other.safetensors"))
-    with pytest.raises(ModelError, match=r"other\.safetensors: the weights do not fit"):
-        load_encoder(tmp_path / "other.safetensors")

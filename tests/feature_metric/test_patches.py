@@ -10,7 +10,9 @@ import pytest
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.layers import Layers
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_features, patch_template, refine
-from fmr_cli.geometry.motion import Motion, exp, rotation_between
+from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.pose_error import angle_between
+from fmr_cli.geometry.se3 import exp
 from fmr_cli.registration.models import solver
 from fmr_cli.synthetic.shapes import shapes
 
@@ -77,7 +79,7 @@ def test_a_motion_is_undone(layers: Layers, body: np.ndarray, centres: np.ndarra
     T = motion(8, 0.04)
     template = patch_template(layers, centres, balls(body), RADIUS)
     fit = refine(layers, template, balls(moved_away(T, body)), np.eye(4), 15)
-    assert math.degrees(rotation_between(fit.g[:3, :3], T[:3, :3])) < 0.05
+    assert math.degrees(angle_between(fit.g[:3, :3], T[:3, :3])) < 0.05
     assert np.linalg.norm(fit.g[:3, 3] - T[:3, 3]) < 1e-3
     assert np.nanmedian(fit.error) < 1e-3 * np.linalg.norm(template.feature, axis=1).mean()
 
@@ -87,7 +89,7 @@ def test_patches_without_a_counterpart_drop_out(layers: Layers, body: np.ndarray
     half = body[body[:, 0] < np.median(body[:, 0])]
     template = patch_template(layers, centres, balls(body), RADIUS)
     fit = refine(layers, template, balls(moved_away(T, half)), np.eye(4), 15)
-    assert math.degrees(rotation_between(fit.g[:3, :3], T[:3, :3])) < 0.5
+    assert math.degrees(angle_between(fit.g[:3, :3], T[:3, :3])) < 0.5
     gone = centres[:, 0] > half[:, 0].max() + RADIUS
     assert gone.any()
     assert np.isnan(fit.error[gone]).all()

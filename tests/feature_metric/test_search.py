@@ -9,10 +9,11 @@ import pytest
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.encoder import Encoder
-from fmr_cli.feature_metric.fast import FastEncoder
-from fmr_cli.feature_metric.search import APART, KEPT, STARTS, Found, search
+from fmr_cli.feature_metric.numpy_solver import NumpySolver
+from fmr_cli.feature_metric.search import APART, ROUNDS, STARTS, Found, search
 from fmr_cli.feature_metric.solver import OnDevice
-from fmr_cli.geometry.motion import Motion, rotation_between, rotations
+from fmr_cli.geometry.motion import Motion, rotations
+from fmr_cli.geometry.pose_error import angle_between
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, target, T_target_source
 
@@ -28,12 +29,12 @@ def turned(bodies_numpy: np.ndarray) -> list[Problem]:
 
 
 @pytest.fixture(scope="module")
-def results(fast: FastEncoder, turned: list[Problem]) -> list[Found]:
+def results(fast: NumpySolver, turned: list[Problem]) -> list[Found]:
     return [search(fast, source, target, rotations(STARTS)) for source, target, _ in turned]
 
 
 def off(found: Found, T: np.ndarray) -> float:
-    return math.degrees(rotation_between(found.g[0, :3, :3], T[:3, :3]))
+    return math.degrees(angle_between(found.g[0, :3, :3], T[:3, :3]))
 
 
 def test_any_rotation_is_found(results: list[Found], turned: list[Problem]) -> None:
@@ -43,16 +44,16 @@ def test_any_rotation_is_found(results: list[Found], turned: list[Problem]) -> N
 
 def test_other_poses_are_distinct_and_worse(results: list[Found]) -> None:
     for found in results:
-        assert 1 <= len(found.g) <= KEPT
+        assert 1 <= len(found.g) <= ROUNDS[-1][2]
         assert (np.diff(found.error) >= 0).all()
         assert found.errors.shape[1] == len(found.g)
         np.testing.assert_array_equal(found.errors[-1], found.error)
         for i in range(len(found.g)):
             for j in range(i):
-                assert rotation_between(found.g[i, :3, :3], found.g[j, :3, :3]) > APART
+                assert angle_between(found.g[i, :3, :3], found.g[j, :3, :3]) > APART
 
 
-def test_the_same_poses_every_run(fast: FastEncoder, turned: list[Problem], results: list[Found]) -> None:
+def test_the_same_poses_every_run(fast: NumpySolver, turned: list[Problem], results: list[Found]) -> None:
     source, target, _ = turned[0]
     assert (search(fast, source, target, rotations(STARTS)).g == results[0].g).all()
 
@@ -63,7 +64,7 @@ def test_torch_finds_the_same_pose(encoder: Encoder, turned: list[Problem], resu
     np.testing.assert_allclose(found.g[0], results[0].g[0], rtol=0, atol=1e-3)
 
 
-def test_a_search_about_the_vertical_keeps_it(fast: FastEncoder, bodies_numpy: np.ndarray) -> None:
+def test_a_search_about_the_vertical_keeps_it(fast: NumpySolver, bodies_numpy: np.ndarray) -> None:
     motion = Motion("yaw")
     source, target, T = problem(bodies_numpy[0], motion.starts(0)[11])  # 165 deg
     found = search(fast, source, target, motion.starts(0), basis=motion.basis())

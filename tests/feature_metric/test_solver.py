@@ -13,7 +13,8 @@ from fmr_cli.evaluation.heldout import Setting, draw, errors, register
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
 from fmr_cli.feature_metric.solver import make_template, solve
 from fmr_cli.geometry import se3
-from fmr_cli.geometry.motion import Motion, rotation_between
+from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.pose_error import angle_between
 from fmr_cli.synthetic.shapes import shapes
 
 
@@ -25,7 +26,7 @@ def turns(count: int, degrees: float, shift: float = 0.0, seed: int = 0) -> Tens
 
 
 def degrees_off(g: Tensor, T: Tensor) -> Tensor:
-    return torch.from_numpy(np.degrees(rotation_between(g[:, :3, :3].double().numpy(), T[:, :3, :3].double().numpy())))
+    return torch.from_numpy(np.degrees(angle_between(g[:, :3, :3].double().numpy(), T[:, :3, :3].double().numpy())))
 
 
 def identity(count: int) -> Tensor:

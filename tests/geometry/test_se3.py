@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -80,3 +83,17 @@ def test_transform_moves_points_batch_by_batch() -> None:
     moved = se3.transform(T, x)
     assert moved.shape == (4, 7, 3)
     torch.testing.assert_close(moved[2, 5], T[2, :3, :3] @ x[5] + T[2, :3, 3])
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, math.pi])
+def test_numpy_gives_what_torch_gives(angle: float) -> None:
+    xi = twists(angle)
+    T = se3.exp(xi)
+    np.testing.assert_allclose(se3.exp(xi.numpy()), T, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(se3.exp(se3.log(T.numpy())), T, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(se3.exp(xi[0].numpy()), T[0], rtol=0, atol=1e-14)
+
+
+def test_geometry_does_not_import_torch() -> None:
+    code = "import sys; from fmr_cli.geometry import observability, pose_error; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fmr_cli.geometry.normals import neighbours, normals_and_variation
-from fmr_cli.geometry.sampling import WORKING_VOXELS, distinct, sample, working_scale
+from fmr_cli.geometry.sampling import OBLIQUE, WORKING_VOXELS, distinct, sample, working_scale
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import occupied_voxels, voxel_downsample
 
@@ -64,6 +64,15 @@ def test_a_sample_repeats_no_point_and_follows_the_seed(scan: np.ndarray) -> Non
 def test_repetitions_go_and_nothing_else(scan: np.ndarray) -> None:
     again = distinct(np.vstack([scan, scan[:300], scan[:1]]))
     assert np.array_equal(np.unique(again, axis=0), np.unique(scan, axis=0))
+
+
+def test_points_of_a_grid_that_meet_on_the_oblique_line_all_stay() -> None:
+    grid = np.random.default_rng(0).integers(-200, 200, (100_000, 3)) / 100
+    expected = np.unique(grid, axis=0)
+    assert len(np.unique(expected @ OBLIQUE)) < len(expected)
+    again = distinct(grid)
+    assert len(again) == len(expected)
+    assert np.array_equal(np.unique(again, axis=0), expected)
 
 
 def test_normals_and_variation_of_a_plane_and_a_corner() -> None:

@@ -10,8 +10,9 @@ import torch
 from safetensors.torch import load_file
 
 from fmr_cli.errors import FmrError, ModelError
-from fmr_cli.feature_metric.encoder import load_encoder, load_weights
+from fmr_cli.registration.models import load_encoder
 from fmr_cli.training.loop import Trainer, TrainingError, read_start
+from fmr_cli.training.weights import load_weights
 
 
 def finish(trainer):

@@ -11,9 +11,10 @@ import torch
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.encoder import Encoder, jacobian
-from fmr_cli.feature_metric.fast import LARGE, FastEncoder
+from fmr_cli.feature_metric.numpy_solver import LARGE, NumpySolver
 from fmr_cli.feature_metric.solver import OnDevice
-from fmr_cli.geometry.motion import Motion, exp
+from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.se3 import exp
 
 START = np.eye(4)[None]
 
@@ -37,7 +38,7 @@ def test_no_torch_is_imported() -> None:
 
 
 def test_feature_and_critical_points_are_those_of_the_encoder(
-    fast: FastEncoder, encoder: Encoder, room: np.ndarray
+    fast: NumpySolver, encoder: Encoder, room: np.ndarray
 ) -> None:
     feature, index = fast.encode(room)
     expected, where = encoder.encode(torch.from_numpy(room)[None])
@@ -48,7 +49,7 @@ def test_feature_and_critical_points_are_those_of_the_encoder(
     assert (index == where[0].numpy()).mean() > 0.99
 
 
-def test_the_jacobian_is_the_exact_one(fast: FastEncoder, encoder: Encoder, room: np.ndarray) -> None:
+def test_the_jacobian_is_the_exact_one(fast: NumpySolver, encoder: Encoder, room: np.ndarray) -> None:
     _, index = fast.encode(room)
     expected = jacobian(encoder, torch.from_numpy(room)[None], torch.from_numpy(index)[None])[0]
     np.testing.assert_allclose(fast.template(room).J, expected, rtol=0, atol=1e-4)
@@ -58,7 +59,7 @@ def test_the_jacobian_is_the_exact_one(fast: FastEncoder, encoder: Encoder, room
 @pytest.mark.parametrize("kind", ["copy", "resample", "noise"])
 @pytest.mark.parametrize("degrees", [5, 50])
 def test_the_pose_of_the_plain_solver(
-    fast: FastEncoder, encoder: Encoder, room: np.ndarray, kind: str, degrees: float, robust: bool
+    fast: NumpySolver, encoder: Encoder, room: np.ndarray, kind: str, degrees: float, robust: bool
 ) -> None:
     source, target = pair(room[:3000], kind, degrees)
     plain = OnDevice(encoder)
@@ -72,7 +73,7 @@ def test_the_pose_of_the_plain_solver(
 @pytest.mark.parametrize("robust", [True, False])
 @pytest.mark.parametrize("kind", ["copy", "resample", "noise"])
 def test_few_of_many_points_lead_to_the_pose_of_all(
-    fast: FastEncoder, encoder: Encoder, room: np.ndarray, kind: str, robust: bool
+    fast: NumpySolver, encoder: Encoder, room: np.ndarray, kind: str, robust: bool
 ) -> None:
     source, target = pair(room, kind, 40)
     assert len(source) >= LARGE
@@ -85,14 +86,14 @@ def test_few_of_many_points_lead_to_the_pose_of_all(
     np.testing.assert_allclose(found.error, everything, rtol=0, atol=1e-6)  # the last error is that of all points
 
 
-def test_threads_change_no_bit(fast: FastEncoder, room: np.ndarray) -> None:
+def test_threads_change_no_bit(fast: NumpySolver, room: np.ndarray) -> None:
     source, target = pair(room, "resample", 30)
     one, two = (fast.solve(fast.template(target, n), source, START, threads=n) for n in (1, 2))
     assert (one.g == two.g).all()
     assert (one.errors == two.errors).all()
 
 
-def test_constrained_and_many_starts(fast: FastEncoder, encoder: Encoder, room: np.ndarray) -> None:
+def test_constrained_and_many_starts(fast: NumpySolver, encoder: Encoder, room: np.ndarray) -> None:
     motion, plain = Motion("yaw"), OnDevice(encoder)
     starts = motion.starts(0)[:5]
     target, source = room[:256], room[256:512]
@@ -102,7 +103,7 @@ def test_constrained_and_many_starts(fast: FastEncoder, encoder: Encoder, room: 
     np.testing.assert_array_equal(found.g[:, 2, :3], np.tile([0.0, 0.0, 1.0], (5, 1)))
 
 
-def test_what_a_point_or_a_line_does_not_determine_shows_in_the_rank_and_stays(fast: FastEncoder) -> None:
+def test_what_a_point_or_a_line_does_not_determine_shows_in_the_rank_and_stays(fast: NumpySolver) -> None:
     point = np.full((100, 3), 0.3, np.float32)
     line = (np.linspace(-0.5, 0.5, 100)[:, None] * [0.6, 0.0, 0.8] + [0.0, 0.1, 0.0]).astype(np.float32)
     for target, rank in ((point, 3), (line, 5)):

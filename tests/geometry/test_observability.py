@@ -1,0 +1,73 @@
+"""What two scans say about the certainty of their pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fmr_cli.geometry import observability
+from fmr_cli.geometry.surface import Surface
+
+Scans = tuple[np.ndarray, np.ndarray]
+EDGE = 0.08  # of the voxels, metres
+
+
+def grid(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    a, b = np.meshgrid(u, v)
+    return a.ravel(), b.ravel()
+
+
+def plane() -> np.ndarray:
+    x, y = grid(np.arange(-2, 2, 0.04), np.arange(-1.5, 1.5, 0.04))
+    return np.stack([x, y, 0 * x], 1)
+
+
+def corridor() -> np.ndarray:
+    x, s = grid(np.arange(-4, 4, 0.06), np.arange(-1, 1, 0.06))
+    one = np.ones_like(x)
+    sides = [[x, s, -one], [x, s, one], [x, -one, s], [x, one, s]]
+    return np.concatenate([np.stack(side, 1) for side in sides])
+
+
+def cylinder() -> np.ndarray:
+    z, angle = grid(np.arange(-2, 2, 0.06), np.linspace(0, 2 * np.pi, 100, endpoint=False))
+    return np.stack([np.cos(angle), np.sin(angle), z], 1)
+
+
+def shaken(points: np.ndarray, seed: int) -> np.ndarray:
+    return points + np.random.default_rng(seed).normal(0, 0.003, points.shape)
+
+
+@pytest.mark.parametrize(("shape", "said"), [
+    (plane, {"shift along (1.00, 0.00, 0.00)", "shift along (0.00, 1.00, 0.00)", "rotation about (0.00, 0.00, 1.00)"}),
+    (corridor, {"shift along (1.00, 0.00, 0.00)"}),
+    (cylinder, {"shift along (0.00, 0.00, 1.00)", "rotation about (0.00, 0.00, 1.00)"}),
+])  # fmt: skip
+def test_what_a_shape_does_not_determine_is_named(shape, said: set[str]) -> None:
+    points = shape()
+    source, target = (Surface(shaken(points, seed), 0.1) for seed in (0, 1))
+    info = observability.information(source, target, np.eye(4), np.zeros(3))
+    weak = observability.undetermined(info, 2.0)
+    assert len(weak) == len(said)
+    kinds = sorted(w.split(" (")[0] for w in weak)
+    assert kinds == sorted(s.split(" (")[0] for s in said)
+    if shape is not plane:  # whose two shifts may be named by any two directions in it
+        assert {w.replace("-0.01", "0.00").replace("0.01", "0.00") for w in weak} == said
+
+
+def test_a_room_determines_everything(room_scans: Scans) -> None:
+    source, target = (Surface(s, EDGE) for s in room_scans)
+    info = observability.information(source, target, np.eye(4), np.zeros(3))
+    assert info.shape == (6, 6)
+    np.testing.assert_allclose(info, info.T, rtol=1e-9, atol=1e-9 * np.abs(info).max())
+    assert np.linalg.eigvalsh(info).min() > 0
+    assert observability.undetermined(info, 2.0) == []
+
+
+def test_more_noise_is_less_information() -> None:
+    points = corridor()
+    still, noisy = (
+        observability.information(Surface(points + n, 0.1), Surface(points, 0.1), np.eye(4), np.zeros(3))[2, 2]
+        for n in np.random.default_rng(0).normal(0, 1, (2, 1, *points.shape)).reshape(2, -1, 3) * [[[0.002]], [[0.02]]]
+    )
+    assert still > 10 * noisy
