@@ -39,6 +39,11 @@ class Surface:
         """(M, 3) unit normals of undetermined sign."""
         return self._shape[0]
 
+    @property
+    def solid(self) -> np.ndarray:
+        """(M,) which points have neighbours enough to be a piece of surface; the others may be dust or a LiDAR's rim."""
+        return self._shape[2] < SPARSE * self.edge
+
     @cached_property
     def unevenness(self) -> tuple[np.ndarray, np.ndarray]:
         """How far the nearest 3 lie off each point's tangent plane, own unit, and 1 - |cosine| of their normals: (M,).

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.point_to_plane import point_to_plane
 from fmr_cli.geometry.surface import Surface
 
 REACH = 4.0  # voxel edges: further off, a point is no business of a surface: a table does not contradict the floor
@@ -20,6 +21,9 @@ TOUCHING = 1.5  # voxel edges: nearer points overlap, as voxels of one surface d
 OVER = 1.0  # voxel edges along the tangent plane, within which a point lies over a surface point
 CLEAR, UNEVEN = 0.5, 2.5  # voxel edges, and times the surface's own unevenness: an offset beyond both contradicts
 ALONG, ACROSS = 0.7, 0.4  # |cosine| between normals: from one on they agree, below the other they contradict
+STRETCH_POINTS = 1500  # of the source, on which a change of scale is tried
+STRETCH_REACH = 2.5  # voxel edges
+STRETCH_SIGMAS = 3.0  # deviations that chance may explain
 FLOOR = 0.01  # offsets in voxel edges, and turns: less than that is as good as none
 
 
@@ -32,6 +36,7 @@ class Agreement:
     offset: how far these lie off each other's tangent planes, root mean square, over how far a surface's own
         neighbours do. turn: the mean of 1 - |cosine| between their normals, over the same. Both are about 1 or less
         where the scans are samples of one surface, whatever its curvature and noise.
+    stretch: by how much the source would have to grow or shrink to fit better, as a share, beyond what chance explains.
     """
 
     explained: int
@@ -41,6 +46,7 @@ class Agreement:
     inlier_rmse: float
     offset: float
     turn: float
+    stretch: float
 
 
 def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> Agreement:
@@ -49,7 +55,9 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
     for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
         moved = transform_points(T, a.points)
         distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
-        here = np.flatnonzero(np.isfinite(distance))
+        near = np.isfinite(distance) & a.solid
+        near[near] = b.solid[index[near]]
+        here = np.flatnonzero(near)
         there, d = index[here], distance[here] / b.edge
         n = b.normals[there]
         off = np.abs(np.einsum("ni,ni->n", moved[here] - b.points[there], n)) / b.edge
@@ -64,8 +72,8 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
             explained.sum(), contradicted.sum(), touching.sum(), (d[touching] ** 2).sum(), (off[touching] ** 2).sum(),
             (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
         ]  # fmt: skip
-        shares.append(touching.sum() / len(moved))
-        explained_shares.append(explained.sum() / len(moved))
+        shares.append(touching.sum() / max(a.solid.sum(), 1))
+        explained_shares.append(explained.sum() / max(a.solid.sum(), 1))
     square, off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
     return Agreement(
         explained=int(sums[0]),
@@ -75,4 +83,22 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
         inlier_rmse=float(np.sqrt(square)) * target.edge if sums[2] else float("inf"),
         offset=float(np.sqrt((off2 + FLOOR**2) / (own_off2 + FLOOR**2))),
         turn=float((max(turns, 0) + FLOOR) / (own_turns + FLOOR)),
+        stretch=stretch(source, target, T_target_source),
     )
+
+
+def stretch(source: Surface, target: Surface, T_target_source: np.ndarray) -> float:
+    """The scale step, |log s|, of one point-to-plane iteration with scale, less STRETCH_SIGMAS of its deviation."""
+    points = source.points[:: max(len(source.points) // STRETCH_POINTS, 1)]
+    reach = STRETCH_REACH * target.edge
+    found = point_to_plane(points, target.points, target.normals, target.tree, T_target_source, reach, np.zeros(3))
+    if found.count < 7:
+        return 0.0
+    # Schur's complement: what is left for the scale once the six others have taken their best.
+    A, b, d = found.A[:6, :6], found.b, found.A[6, :6]
+    solved = np.linalg.lstsq(A, np.column_stack([d, b[:6]]), rcond=1e-9)[0]
+    information = found.A[6, 6] - d @ solved[:, 0]
+    if information <= 1e-9 * found.A[6, 6]:
+        return 0.0  # a plane or a sphere about its centre has no scale of its own
+    step = abs(b[6] - d @ solved[:, 1]) / information
+    return float(max(step - STRETCH_SIGMAS * np.sqrt(found.variance / information), 0.0))

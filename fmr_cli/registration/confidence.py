@@ -74,9 +74,13 @@ class Candidate:
 
 @dataclass
 class Judge:
-    """Weighs the poses of one pair against each other. candidates: distinct poses, best first."""
+    """Weighs the poses of one pair against each other.
+
+    candidates: distinct poses, best first. repeats: how much of the scene repeats itself, see ``hypotheses.rivals``.
+    """
 
     pair: Pair
+    repeats: float = 0.0
     candidates: list[Candidate] = field(default_factory=list)
 
     def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:

@@ -18,9 +18,9 @@ from fmr_cli.registration.pair import CONSENSUS_TOLERANCE, Pair
 CONSENSUS_POSES = 10  # poses that matches agree on, at most
 RUNNERS_UP = 3  # of the other cloud's keypoints, after the one that a match goes to
 ELSEWHERE = 4.0  # voxel edges: a runner-up nearer to the match shows the same place
-RIVAL_SHARE = 0.15  # of the matches behind a pose that must have their like behind a rival
-RIVAL_MATCHES = 5  # at least: fewer agree by chance
-RIVAL_SCORE = 0.5  # of the pose's own overlap score, that a rival has at least
+RIVAL_SHARE = 0.08  # of the matches behind a pose that must have their like behind a rival
+RIVAL_MATCHES = 4  # at least: fewer agree by chance
+RIVAL_SCORE = 0.35  # of the pose's own overlap score, that a rival has at least
 RIVALS = 12  # at most: of a longer row, the nearest
 ORBIT = 24  # poses tried along what maps a cloud onto itself: a gear's turns, both ways along a facade
 
@@ -76,8 +76,10 @@ def from_solver(pair: Pair, T_target_source: np.ndarray, start: str) -> list[Hyp
     return [Hypothesis(T, start, pair.overlap_score(T), found.errors[:, 0].tolist())]
 
 
-def rivals(pair: Pair, T_target_source: np.ndarray) -> list[Hypothesis]:
+def rivals(pair: Pair, T_target_source: np.ndarray) -> tuple[list[Hypothesis], float]:
     """Poses that fit as well as this one might, where the scene repeats itself: the nearest ones of its orbit.
+
+    And how much of the scene repeats: the share of the matches behind the pose that agree on another one.
 
     The matches behind the pose have runners-up: other places that look alike. What pose these agree on, T', differs
     from T by a motion S = T' T^-1 that maps the target (or, S' = T^-1 T', the source) onto itself: a period of a
@@ -85,11 +87,12 @@ def rivals(pair: Pair, T_target_source: np.ndarray) -> list[Hypothesis]:
     """
     x, y = runners_up(pair, T_target_source)
     if len(x) < RIVAL_MATCHES:
-        return []
+        return [], 0.0
     motion = Motion(pair.motion.dof, pair.motion.up, pair.motion.lift / pair.edge)
     poses, counts = consensus(x / pair.edge, y / pair.edge, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)
     poses[:, :3, 3] *= pair.edge
-    least = max(RIVAL_MATCHES, RIVAL_SHARE * pair.inlier_count(T_target_source))
+    behind = max(pair.inlier_count(T_target_source), 1)
+    least = max(RIVAL_MATCHES, RIVAL_SHARE * behind)
     back = np.linalg.inv(T_target_source)
     generators = [T @ back for T, count in zip(poses, counts, strict=True) if count >= least]
     generators += [np.linalg.inv(S) for S in generators]
@@ -106,7 +109,7 @@ def rivals(pair: Pair, T_target_source: np.ndarray) -> list[Hypothesis]:
         if score >= floor and pair.allowed(T):
             found.append(Hypothesis(T, "rival", score))
             queue += [S @ T for S in generators]
-    return found
+    return found, min(float(counts.max(initial=0)) / behind, 1.0)
 
 
 def runners_up(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -131,7 +131,9 @@ class Pair:
     @cached_property
     def some(self) -> tuple[np.ndarray, np.ndarray]:
         """A few of the source's points, and their normals: (n, 3) each."""
-        both = sample(np.hstack([self.s.points, self.s.normals]), RANKING_POINTS, np.random.default_rng(self.seed))
+        both = np.hstack([self.s.points, self.s.normals])
+        solid = both[self.s.solid] if self.s.solid.sum() >= MIN_POINTS else both
+        both = sample(solid, RANKING_POINTS, np.random.default_rng(self.seed))
         return both[:, :3], both[:, 3:]
 
     def overlap_score(self, T_target_source: np.ndarray) -> float:

@@ -136,7 +136,8 @@ def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch) -> None:
                 judge_refined(judge, hypothesis)
     with time.stage("rivals"):
         if judge.sure(LIKELY):
-            for hypothesis in hypotheses.rivals(pair, judge.best.T_target_source):
+            rivals, judge.repeats = hypotheses.rivals(pair, judge.best.T_target_source)
+            for hypothesis in rivals:
                 if not judge.knows(hypothesis.T_target_source):
                     judge_refined(judge, hypothesis)
 

@@ -10,6 +10,7 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.gicp import GicpCloud
 from fmr_cli.geometry.sampling import distinct, sample, thinned, working_scale
+from fmr_cli.geometry.strays import Strays, strays
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.registration.memo import Memo
@@ -25,7 +26,7 @@ class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, within bounds, for its next pair.
 
     points: (N, 3) float64, centred, at most AT_MOST, finite and distinct. frame: the centred coordinates, whose origin
-    is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. Raises
+    is the mean of the cloud. set_aside: how many points are no surface, by why (see ``strays``). edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. Raises
     RegistrationError: fewer than 10 distinct points, all in one place.
     """
 
@@ -33,6 +34,8 @@ class Prepared:
         rng = np.random.default_rng(seed)
         points = thinned(cloud.points, AT_MOST, rng)
         points = points[np.isfinite(points).all(1)]
+        found = strays(points, np.random.default_rng(seed)) if len(points) else Strays(np.ones(0, bool), {})
+        points, self.set_aside = points[found.keep], found.reasons
         self.frame = Frame(points.mean(0) if len(points) else np.zeros(3))
         points = distinct(self.frame.enter(points))
         if len(points) == 1 and len(cloud) > 1:

@@ -23,7 +23,7 @@ from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS
 LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; GICP does the rest
 FINE = LEVELS[1:]
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, IC iterations, points of a patch
-PLANE_REACHES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.0, 1.0)  # voxel edges, a step each
+PLANE_REACHES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.7)  # voxel edges, a step each
 DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
 GICP_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
