@@ -53,7 +53,9 @@ def adjust(survey: Survey) -> Network:
         anchors.append(None if component.held else survey.scans[anchor].name)
     links = [judged(survey, survey.links[ends]) for ends in sorted(survey.links, key=lambda e: (e[1], e[0]))]
     counts = {"scans": len(scans), "looked_at": len(survey.looks), "registered": len(survey.tried)}
-    return Network(scans, links, anchors, apart(survey), survey.frames, counts, survey.seconds, survey.settings(), survey.scans)
+    return Network(
+        scans, links, anchors, apart(survey), survey.frames, counts, survey.seconds, survey.settings(), survey.scans
+    )
 
 
 def adjusted(survey: Survey, component: Component) -> tuple[Solution, int]:
@@ -106,7 +108,11 @@ def agreeing(survey: Survey, component: Component) -> list[Link]:
         ]
         best = int(np.argmin(off))
         both_held = link.source in component.held and link.target in component.held
-        if off[best] <= AGREE * lenient * link.edge and link.hypotheses[best].confidence >= LEAST_CONFIDENT and not both_held:
+        if (
+            off[best] <= AGREE * lenient * link.edge
+            and link.hypotheses[best].confidence >= LEAST_CONFIDENT
+            and not both_held
+        ):
             link.chosen = best
             used.append(link)
             if best > 0 and link.status == "aligned":
@@ -182,7 +188,10 @@ def judged(survey: Survey, link: Link) -> Link:
         poses = survey.components[home[link.source]].T_component_scan
         network = np.linalg.inv(poses[link.target]) @ poses[link.source]
         D = np.linalg.inv(network) @ link.T_target_source
-        link.residual_rot_deg, link.residual_shift = angle_degrees(D), float(np.linalg.norm(link.T_target_source[:3, 3] - network[:3, 3]))
+        link.residual_rot_deg, link.residual_shift = (
+            angle_degrees(D),
+            float(np.linalg.norm(link.T_target_source[:3, 3] - network[:3, 3])),
+        )
     elif link.status == "aligned":
         return replace(link, status="rejected", message=said(link, "too much speaks against joining its components"))
     return link

@@ -19,7 +19,10 @@ from fmr_cli.multiway.looks import displacement
 AGREE = 4.0  # voxel edges, root mean square over a scan, that poses of one link or cycle may differ by
 CHANCE = 0.05  # that a wrong hypothesis agrees with another by accident, or since a place repeats itself
 JOINED = 0.5  # probability from which scans are joined: that from which ``align`` calls a pose aligned
-DENIALS = ((0.5, 3.0), (0.3, 1.0))  # at so much overlap a link that found nothing is e^-x as likely if the join is right
+DENIALS = (
+    (0.5, 3.0),
+    (0.3, 1.0),
+)  # at so much overlap a link that found nothing is e^-x as likely if the join is right
 CERTAIN = 12.0  # log odds, at most, of one hypothesis
 
 
@@ -76,7 +79,10 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
                         reach = AGREE * 1.5 * max(link.edge, a.edge, b.edge)
                         T_ki, T_jk = poses_along(a, i, k), poses_along(b, k, j)
                         off = displacement(T_jk[:, None] @ T_ki[None], h.T_target_source, moments[i])
-                        odds = [[log_odds(x.confidence) + log_odds(y.confidence) for x in a.hypotheses] for y in b.hypotheses]
+                        odds = [
+                            [log_odds(x.confidence) + log_odds(y.confidence) for x in a.hypotheses]
+                            for y in b.hypotheses
+                        ]
                         agreed = np.where(off < reach, np.array(odds) - np.log(CHANCE), 0.0)
                         best = max(best, float(agreed.max()))
                 support += best
@@ -129,7 +135,9 @@ def joined(
         _, a, b = max(sure)
         a, b = -a, -b
         join, T = joins[a, b], joins[a, b].T_second_first
-        if components[b].held or (not components[a].held and len(components[b].T_component_scan) > len(components[a].T_component_scan)):
+        if components[b].held or (
+            not components[a].held and len(components[b].T_component_scan) > len(components[a].T_component_scan)
+        ):
             keep, gone, T_keep_gone = b, a, T
         else:
             keep, gone, T_keep_gone = a, b, np.linalg.inv(T)
@@ -153,7 +161,9 @@ def joined(
             joins[key] = best_join(
                 components[key[0]], components[key[1]], links, between[key], silent[key], moments, overlap
             )
-    order = sorted(components, key=lambda c: (-len(components[c].T_component_scan), min(components[c].T_component_scan)))
+    order = sorted(
+        components, key=lambda c: (-len(components[c].T_component_scan), min(components[c].T_component_scan))
+    )
     place = {c: n for n, c in enumerate(order)}
     left = {tuple(sorted((place[a], place[b]))): join for (a, b), join in joins.items()}
     return [components[c] for c in order], left  # type: ignore[return-value]

@@ -105,8 +105,11 @@ def refine(
     basis = {i: np.kron(np.eye(2), start[i][:3, :3]).T @ motion.basis() for i in free}  # what may move, in i's frame
     covariance, residual = {i: np.zeros((6, 6)) for i in poses}, dict.fromkeys(poses, float("nan"))
     for factor in REACHES:
+
         def system(pair: tuple[int, int], factor: float = factor) -> System | None:
-            return linearised(views[pair[0]], views[pair[1]], *pair, np.linalg.inv(poses[pair[1]]) @ poses[pair[0]], factor)
+            return linearised(
+                views[pair[0]], views[pair[1]], *pair, np.linalg.inv(poses[pair[1]]) @ poses[pair[0]], factor
+            )
 
         both = [pair for i, j in pairs for pair in ((i, j), (j, i))]
         systems = [s for s in pool.map(system, both) if s is not None]

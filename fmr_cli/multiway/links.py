@@ -156,5 +156,6 @@ class Journal:
 
 def key_of(source: int, target: int, start: str, options: Options) -> str:
     """What names an attempt: the scans, the kind of start and, for a given pose, its bits."""
-    digest = hashlib.sha256(options.init.tobytes()).hexdigest()[:16] if isinstance(options.init, np.ndarray) else ""
+    init = options.init
+    digest = "" if isinstance(init, str) else hashlib.sha256(np.asarray(init, float).tobytes()).hexdigest()[:16]
     return f"{source} {target} {start} {digest}"

@@ -6,7 +6,6 @@ which worker was first.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -20,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 import fmr_cli
 from fmr_cli.cloud import PointCloud
+from fmr_cli.cores import usable_cores
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.frames import Frame, enter_frames, leave_frames
 from fmr_cli.geometry.motion import Motion
@@ -88,7 +88,7 @@ def align_many(
     read, or a pair that cannot be registered, is a row that says so.
     """
     pose_graph.check_installed()
-    survey = Survey(list_scans(scans, out), options, known, out, workers or cores(), progress)
+    survey = Survey(list_scans(scans, out), options, known, out, workers or usable_cores(), progress)
     with survey.at_work(resume):
         survey.prepare()
         survey.take_known_links()
@@ -157,7 +157,10 @@ class Survey:
             if not self.out.is_dir():
                 check_writable(self.out)
                 self.out.mkdir()
-            found, path = self.journal.read() if resume or not (self.out / "journal.jsonl").exists() else {}, self.journal.path
+            found, path = (
+                self.journal.read() if resume or not (self.out / "journal.jsonl").exists() else {},
+                self.journal.path,
+            )
             if found == {}:
                 raise CloudFileError(f"{path}: is there already, add --resume to go on with it or give another --out")
             if found is None:
@@ -195,7 +198,13 @@ class Survey:
     def prepare(self) -> None:
         """Reads every scan once, chooses the grids that scans of like size share, and describes each on its own."""
         with self.stage("read"):
-            own = dict(zip(range(len(self.scans)), self.each("reading", self.own_edge, list(range(len(self.scans)))), strict=True))
+            own = dict(
+                zip(
+                    range(len(self.scans)),
+                    self.each("reading", self.own_edge, list(range(len(self.scans)))),
+                    strict=True,
+                )
+            )
             self.note_twins()
         usable = [n for n, edge in own.items() if edge is not None]
         self.failed = set(own) - set(usable)
@@ -208,8 +217,12 @@ class Survey:
             self.each("describing", lambda n: self.description(n, self.edges[n]), usable)
         median = float(np.median(shared))
         for n in usable:
-            if not looks.comparable(self.edges[n], median) and self.edges[n] / median > 30 or self.edges[n] / median < 1 / 30:
-                self.note(n, f"its points lie {self.edges[n] / median:.3g} times as far apart as others': in another unit?")
+            if (not looks.comparable(self.edges[n], median) and self.edges[n] / median > 30) or self.edges[
+                n
+            ] / median < 1 / 30:
+                self.note(
+                    n, f"its points lie {self.edges[n] / median:.3g} times as far apart as others': in another unit?"
+                )
 
     def own_edge(self, number: int) -> float | None:
         """The voxel edge that suits a scan, or None (and a message) where it cannot be used."""
@@ -293,15 +306,15 @@ class Survey:
     def motion(self, source: int, target: int, unit: float = 1.0) -> Motion:
         """What may move between two centred frames, lengths in ``unit``."""
         up = np.asarray(self.options.up, float)
-        if not np.isfinite(up).all() or np.linalg.norm(up) == 0:
-            raise FmrError(f"--up {self.options.up}: is no direction; give three numbers, not all zero")
         up = up / np.linalg.norm(up)
         lift = float(up @ (self.frames[source].origin - self.frames[target].origin)) / unit
         return Motion(self.options.dof, (float(up[0]), float(up[1]), float(up[2])), lift)
 
     def possible(self, source: int, target: int) -> bool:
         """Whether a pair can be linked at all: not forbidden, of like scale, near enough by the poses known."""
-        if tuple(sorted((source, target))) in self.never or not looks.comparable(self.edges[source], self.edges[target]):
+        if tuple(sorted((source, target))) in self.never or not looks.comparable(
+            self.edges[source], self.edges[target]
+        ):
             return False
         if source in self.poses and target in self.poses:
             T, slack = self.predicted(source, target)
@@ -543,7 +556,9 @@ def flipped(link: Link) -> Link:
         return link
     hypotheses = [Hypothesis(np.linalg.inv(h.T_target_source), h.confidence) for h in link.hypotheses]
     A = pose_graph.adjoint(link.T_target_source)
-    return replace(link, source=link.target, target=link.source, hypotheses=hypotheses, information=A.T @ link.information @ A)
+    return replace(
+        link, source=link.target, target=link.source, hypotheses=hypotheses, information=A.T @ link.information @ A
+    )
 
 
 def size_of(path: Path | None) -> tuple[int, int] | None:
@@ -552,7 +567,3 @@ def size_of(path: Path | None) -> tuple[int, int] | None:
         return None
     status = path.stat()
     return status.st_size, status.st_mtime_ns
-
-
-def cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -149,7 +149,9 @@ def without(factor: Factor, poses: dict[int, np.ndarray], marginals: object, rob
 def prior_factor(scan: int, pose: np.ndarray, information: np.ndarray) -> object:
     import gtsam
 
-    return gtsam.PriorFactorPose3(scan, gtsam.Pose3(pose), gtsam.noiseModel.Gaussian.Information(symmetric(information)))
+    return gtsam.PriorFactorPose3(
+        scan, gtsam.Pose3(pose), gtsam.noiseModel.Gaussian.Information(symmetric(information))
+    )
 
 
 def symmetric(A: np.ndarray) -> np.ndarray:

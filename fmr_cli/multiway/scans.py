@@ -42,7 +42,9 @@ def list_scans(given: Iterable[str | Path | PointCloud], out: Path | None = None
             continue
         path = Path(item)
         if path.is_dir():
-            sources += [file for file in find_scans([path]) if out is None or out.resolve() not in file.resolve().parents]
+            sources += [
+                file for file in find_scans([path]) if out is None or out.resolve() not in file.resolve().parents
+            ]
         elif is_list(path):
             sources += in_list(path)
         else:
@@ -50,7 +52,9 @@ def list_scans(given: Iterable[str | Path | PointCloud], out: Path | None = None
             sources.append(path)
     if len(sources) < 2:
         where = ", ".join(str(item) for item in given if not isinstance(item, PointCloud)) or "the list of clouds"
-        raise FmrError(f"{where}: {'one scan' if sources else 'no scan'} only, a network has two or more; give more files")
+        raise FmrError(
+            f"{where}: {'one scan' if sources else 'no scan'} only, a network has two or more; give more files"
+        )
     named = [Scan(name, source) for name, source in zip(names(sources), sources, strict=True)]
     return sorted(named, key=lambda scan: natural(scan.name))
 
