@@ -134,7 +134,7 @@ def joined(
             break
         _, a, b = max(sure)
         a, b = -a, -b
-        join, T = joins[a, b], joins[a, b].T_second_first
+        T = joins[a, b].T_second_first
         if components[b].held or (
             not components[a].held and len(components[b].T_component_scan) > len(components[a].T_component_scan)
         ):
@@ -148,13 +148,7 @@ def joined(
         between.pop((a, b))
         touched = {keep}
         for table in (between, silent):
-            for key in [k for k in table if gone in k]:
-                other = key[0] if key[1] == gone else key[1]
-                if other != keep:
-                    merged = tuple(sorted((keep, other)))
-                    table[merged].extend(table[key])  # type: ignore[index]
-                    touched.add(other)
-                del table[key]
+            touched |= rekeyed(table, gone, keep)
         for key in [k for k in joins if gone in k]:
             del joins[key]
         for key in [k for k in between if keep in k and (k[0] in touched and k[1] in touched)]:
@@ -165,8 +159,20 @@ def joined(
         components, key=lambda c: (-len(components[c].T_component_scan), min(components[c].T_component_scan))
     )
     place = {c: n for n, c in enumerate(order)}
-    left = {tuple(sorted((place[a], place[b]))): join for (a, b), join in joins.items()}
-    return [components[c] for c in order], left  # type: ignore[return-value]
+    left = {(min(place[a], place[b]), max(place[a], place[b])): join for (a, b), join in joins.items()}
+    return [components[c] for c in order], left
+
+
+def rekeyed(table: dict[tuple[int, int], list], gone: int, keep: int) -> set[int]:
+    """Moves what lies between ``gone`` and others to ``keep``; returns these others."""
+    others = set()
+    for key in [k for k in table if gone in k]:
+        other = key[0] if key[1] == gone else key[1]
+        if other != keep:
+            table[min(keep, other), max(keep, other)].extend(table[key])
+            others.add(other)
+        del table[key]
+    return others
 
 
 def best_join(

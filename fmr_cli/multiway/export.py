@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.batch.run import suffix_for
+from fmr_cli.batch.one_pair import suffix_for
 from fmr_cli.cloud import PointCloud
 from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.voxels import cell_numbers

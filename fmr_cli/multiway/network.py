@@ -107,11 +107,12 @@ class Network:
 
     def link_dict(self, link: Link) -> dict[str, Any]:
         said = {name: value for name, value in vars(link).items() if name not in ("hypotheses", "source", "target")}
-        frames = self.frames.get(link.source), self.frames.get(link.target)
         hypotheses = [
-            {"T_target_source": leave_frames(h.T_target_source, *frames), "confidence": h.confidence}
+            {
+                "T_target_source": leave_frames(h.T_target_source, self.frames[link.source], self.frames[link.target]),
+                "confidence": h.confidence,
+            }
             for h in link.hypotheses
-            if frames[0] and frames[1]
-        ]  # type: ignore[arg-type]
+        ]
         return {"source": self.scans[link.source].name, "target": self.scans[link.target].name, **said,
                 "confidence": link.confidence, "hypotheses": hypotheses}  # fmt: skip

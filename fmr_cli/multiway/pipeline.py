@@ -296,7 +296,9 @@ class Survey:
         edge = max(self.pair_edge(*pair), 1e-300)
         a, b = (self.description(n, edge) for n in pair)
         found = looks.look(a, b, self.motion(*pair, edge))
-        return found if self.allowed(*pair, found.T_target_source) else looks.Look(0.0, found.T_target_source)
+        return (
+            found if self.allowed(pair[0], pair[1], found.T_target_source) else looks.Look(0.0, found.T_target_source)
+        )
 
     def pair_edge(self, source: int, target: int) -> float:
         from fmr_cli.registration.prepared import pair_edge
@@ -327,17 +329,16 @@ class Survey:
         """T_target_source between centred frames by the known poses, and how far off that may be (three sigmas)."""
         a, b = self.poses[source], self.poses[target]
         T = enter_frames(np.linalg.inv(b.T_world_scan) @ a.T_world_scan, self.frames[source], self.frames[target])
-        sigmas = [self.sigmas(n) for n in (source, target)]
-        radius = np.sqrt(np.trace(self.description(source, self.edges[source]).moment[:3, :3]))
-        lever = float(np.linalg.norm(T[:3, 3])) + float(radius)
-        return T, 3 * float(np.hypot(*(s[1] for s in sigmas)) + np.hypot(*(s[0] for s in sigmas)) * lever)
+        (turn_a, shift_a), (turn_b, shift_b) = self.sigmas(source), self.sigmas(target)
+        lever = float(np.linalg.norm(T[:3, 3])) + self.radius(source)
+        return T, 3 * float(np.hypot(shift_a, shift_b) + np.hypot(turn_a, turn_b) * lever)
 
     def sigmas(self, number: int) -> tuple[float, float]:
         """Of a known pose: radians, file's unit."""
         pose = self.poses[number]
-        radius = float(np.sqrt(np.trace(self.description(number, self.edges[number]).moment[:3, :3])))
-        rot = ROUGH_DEGREES if pose.sigma_rot_deg is None else pose.sigma_rot_deg
-        return float(np.radians(rot)), ROUGH_SHARE * radius if pose.sigma_shift is None else pose.sigma_shift
+        turn = ROUGH_DEGREES if pose.sigma_rot_deg is None else pose.sigma_rot_deg
+        shift = ROUGH_SHARE * self.radius(number) if pose.sigma_shift is None else pose.sigma_shift
+        return float(np.radians(turn)), shift
 
     def allowed(self, source: int, target: int, T_target_source: np.ndarray) -> bool:
         """Whether a pose keeps to the known poses and to ``max_shift``."""
@@ -373,7 +374,7 @@ class Survey:
         with self.stage("register"):
             for link in self.each("registering", one, attempts):
                 self.tried.add((*sorted(link.ends), link.start))  # type: ignore[arg-type]
-                kept = [h for h in link.hypotheses if self.allowed(*link.ends, h.T_target_source)]
+                kept = [h for h in link.hypotheses if self.allowed(link.source, link.target, h.T_target_source)]
                 if link.hypotheses and not kept:
                     link = replace(link, status="uncertain", message="no pose within the known poses and --max-shift")
                 self.keep(replace(link, hypotheses=kept))
