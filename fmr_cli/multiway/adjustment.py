@@ -40,13 +40,14 @@ def adjust(survey: Survey) -> Network:
         with survey.stage("joint refinement"):
             refined = refine(survey, component, solution, anchor)
         world = survey.world() if component.held else survey.frames[anchor]
-        to_anchor = np.eye(4) if component.held else np.linalg.inv(refined.T_component_scan[anchor])
+        to_world = np.eye(4) if component.held else np.linalg.inv(refined.T_component_scan[anchor])
         for n in sorted(component.T_component_scan):
-            component.T_component_scan[n] = refined.T_component_scan[n]
+            found = [to_world @ poses.T_component_scan[n] for poses in (solution, refined)]
+            graph, T = (np.eye(4) if n == anchor and not component.held else leave_frames(pose, survey.frames[n], world)
+                        for pose in found)  # fmt: skip
             scans[n].status, scans[n].component = "placed", len(anchors)
-            scans[n].T_component_scan = leave_frames(
-                to_anchor @ refined.T_component_scan[n], survey.frames[n], world
-            )  # fmt: skip
+            scans[n].T_component_scan, scans[n].T_component_scan_graph = T, graph
+            component.T_component_scan[n] = refined.T_component_scan[n]
             scans[n].covariance = refined.covariance[n]
             scans[n].residual = refined.residual[n]
             scans[n].links = sum(n in link.ends and link.chosen is not None for link in survey.links.values())
@@ -74,10 +75,7 @@ def adjusted(survey: Survey, component: Component) -> tuple[Solution, int]:
         factors = [factor_of(survey, link) for link in used]
         solution = pose_graph.optimise(poses, factors, priors, held, motion, edge)
         poses = solution.T_component_scan
-        off = np.array([
-            np.nan if T is None else float(looks.displacement(T, link.T_target_source, moment(survey, link.source))) / link.edge
-            for T, link in zip(solution.apart, used, strict=True)
-        ])  # fmt: skip
+        off = np.array([contradiction(survey, link, T) for T, link in zip(solution.apart, used, strict=True)])
         told = np.isfinite(off)
         limit = max(DOUBTFUL, OUTLYING * float(np.median(off[told]))) if told.any() else np.inf
         worst = [k for k in np.argsort(-np.nan_to_num(off)) if told[k] and off[k] > limit][: max(1, len(used) // 20)]
@@ -122,6 +120,14 @@ def agreeing(survey: Survey, component: Component) -> list[Link]:
             what = "the poses of the fixed scans" if both_held else "other links"
             link.message = said(link, f"contradicts {what}: {off[0]:.3g} apart")
     return used
+
+
+def contradiction(survey: Survey, link: Link, T_target_source: np.ndarray | None) -> float:
+    """How far a link lies from where the others have it (4, 4), in edges; NaN where they don't say."""
+    if T_target_source is None:
+        return float("nan")
+    off = looks.displacement(T_target_source, link.T_target_source, moment(survey, link.source))
+    return float(off) / link.edge
 
 
 def said(link: Link, text: str) -> str:
@@ -174,8 +180,8 @@ def refine(survey: Survey, component: Component, solution: Solution, anchor: int
 
     pairs = joint.partners(poses, shared, rejected)
     numbers = sorted(poses)
-    views = dict(zip(numbers, survey.each("refining", lambda n: joint.view(survey.store.prepared(n), survey.edges[n]), numbers),
-                     strict=True))  # fmt: skip
+    made = survey.each("refining", lambda n: joint.view(survey.store.prepared(n), survey.edges[n]), numbers)
+    views = dict(zip(numbers, made, strict=True))
     priors: list[Prior] = [p for p in survey.priors() if p.scan in poses]
     motion = survey.motion(anchor, anchor)
     return joint.refine(poses, views, pairs, held, motion, survey.pool, priors)

@@ -28,7 +28,7 @@ CERTAIN = 12.0  # log odds, at most, of one hypothesis
 
 @dataclass
 class Component:
-    """Scans with one frame. T_component_scan: by scan, between centred frames. held: scans that were told not to move."""
+    """Scans with one frame. T_component_scan: by scan, between centred frames. held: scans that don't move."""
 
     T_component_scan: dict[int, np.ndarray]
     held: set[int] = field(default_factory=set)
@@ -103,7 +103,7 @@ def joined(
     overlap: Callable[[int, int, np.ndarray], float],
     fixed: Component | None = None,
 ) -> tuple[list[Component], dict[tuple[int, int], Join]]:
-    """Components of ``count`` scans, largest first, and the best join of each two that stay apart (by place in the list).
+    """Components of ``count`` scans, largest first, and the best join of each two that stay apart, by their places.
 
     overlap: of two scans (source, target) at a pose. fixed: scans whose poses are given.
     """

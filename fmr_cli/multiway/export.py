@@ -41,7 +41,8 @@ def write_network(network: Network, out: Path) -> None:
         scans.append({
             "scan": scan.name, "component": "" if scan.component is None else scan.component, "pose": path,
             "status": scan.status, "links": scan.links, "residual": number(scan.residual),
-            "sigma_rot_deg": number(scan.sigma_rot_deg), "sigma_shift": number(scan.sigma_shift), "message": scan.message,
+            "sigma_rot_deg": number(scan.sigma_rot_deg), "sigma_shift": number(scan.sigma_shift),
+            "message": scan.message,
         })  # fmt: skip
     links = []
     for link in network.links:

@@ -33,7 +33,7 @@ HOLD = 1.0  # edges: sigma that holds the directions which no pair determines wh
 
 @dataclass(frozen=True)
 class View:
-    """A scan on the joint refinement's grid, centred: points, normals (M, 3), tree; some: rows that are brought over."""
+    """A scan on the joint refinement's grid, centred: points, normals (M, 3), tree; some: rows brought over."""
 
     edge: float
     points: np.ndarray
@@ -180,8 +180,8 @@ def determined(A: np.ndarray, b: np.ndarray, radius: float) -> tuple[np.ndarray,
 def misfit(systems: list[System], floor: float, views: dict[int, View]) -> float:
     """By how much pairs contradict each other beyond their noise: the median of b A^-1 b, 1 where they don't.
 
-    A pair alone would move by -A^-1 b. Points err together (bent scans, moving things), so this is often far above 1; it
-    multiplies the covariance, as an adjustment's variance of unit weight does.
+    A pair alone would move by -A^-1 b. Points err together (bent scans, moving things), so this is often far above 1;
+    it multiplies the covariance, as an adjustment's variance of unit weight does.
     """
     ratios = []
     for s in systems:

@@ -33,7 +33,7 @@ class Hypothesis:
 class Link:
     """Two scans, by number, and what registering them has given.
 
-    status: as ``align`` says, "failed" where it could not, "rejected" where the network has thrown out what was aligned.
+    status: as ``align`` says, "failed" where it could not, "rejected" where the network has thrown it out.
     start: "features", "auto", "pose" (from where the network had it), "known" (given, not registered).
     hypotheses: best first. information: (6, 6) of a twist (rotation, translation) in the target's centred frame.
     chosen: the hypothesis that agrees with the network, or None.
@@ -62,7 +62,7 @@ class Link:
         return self.hypotheses[0].confidence if self.hypotheses else 0.0
 
     @property
-    def T_target_source(self) -> np.ndarray:
+    def T_target_source(self) -> np.ndarray:  # noqa: N802 (the field's name for it)
         """The pose that the network has chosen, or the most confident one."""
         return self.hypotheses[self.chosen or 0].T_target_source
 
@@ -74,8 +74,9 @@ def register(store: Store, source: int, target: int, start: str, options: Option
         found = align(a, b, options, threads=1)
         poses = [(found.T_target_source, found.confidence)]
         poses += [(np.array(x["T_target_source"]), x["confidence"]) for x in found.alternatives]
+        hypotheses = [Hypothesis(enter_frames(T, a.frame, b.frame), float(c)) for T, c in poses]
         return Link(
-            source, target, found.status, start, [Hypothesis(enter_frames(T, a.frame, b.frame), float(c)) for T, c in poses],
+            source, target, found.status, start, hypotheses,
             found.information, found.overlap, found.inlier_rmse, found.voxel_size, "; ".join(found.undetermined),
         )  # fmt: skip
     except ModelError:
@@ -114,7 +115,7 @@ class Journal:
         self.lock = threading.Lock()
 
     def read(self) -> dict[str, Any] | None:
-        """Reads what is there, without a last line that a kill has torn; returns its settings, None where there are none."""
+        """Reads what is there, without a last line that a kill has torn; returns its settings, or None."""
         if self.path is None or not self.path.exists():
             return None
         whole = self.path.read_bytes()

@@ -19,8 +19,8 @@ class Placed:
 
     status: "placed", "unplaced" (no sure link to another one), "failed" (cannot be read or registered at all).
     component: from 0, the largest first, or None. T_component_scan: (4, 4) float64, file's coordinates of the scan to
-    its component's frame, or None. links: how many join it. residual: root mean square point-to-plane distance to the
-    scans it overlaps, file's unit. covariance: (6, 6) of a twist (rotation, translation) about the scan's mean, in the
+    its component's frame, or None; T_component_scan_graph: the same before the joint refinement. links: how many join
+    it. residual: root mean square point-to-plane distance to the scans it overlaps, file's unit. covariance: (6, 6) of a twist (rotation, translation) about the scan's mean, in the
     scan's axes, relative to the component's frame; sigma_rot_deg, sigma_shift: its largest standard deviations.
     """
 
@@ -29,6 +29,7 @@ class Placed:
     status: Literal["placed", "unplaced", "failed"]
     component: int | None = None
     T_component_scan: np.ndarray | None = None
+    T_component_scan_graph: np.ndarray | None = None
     links: int = 0
     residual: float = float("nan")
     covariance: np.ndarray | None = None
@@ -63,8 +64,8 @@ class Apart:
 class Network:
     """Many scans and their links.
 
-    scans: in natural order of their names. links: one a pair tried; their poses are between centred frames (``pose`` has
-    them in files' coordinates). anchors: by component, the scan whose frame is the component's, or None where fixed
+    scans: in natural order of their names. links: one a pair tried; their poses are between centred frames (``pose``
+    has them in files' coordinates). anchors: by component, the scan whose frame is the component's, or None where fixed
     scans give it. apart: what would join components. counts: pairs looked at and registered; seconds: by stage.
     """
 

@@ -43,10 +43,9 @@ class Prior:
 
 @dataclass
 class Solution:
-    """T_component_scan by scan; covariance: (6, 6) by scan, twist on the right; redundancy of each factor is in ``apart``.
+    """T_component_scan by scan; covariance: (6, 6) by scan, of a twist on the right.
 
-    apart: by factor, T (4, 4): how far, as T_target_source, all the others alone would have it; None where no cycle
-    says anything about it.
+    apart: by factor, the T_target_source (4, 4) that all the others alone would have; None where they say nothing.
     """
 
     T_component_scan: dict[int, np.ndarray]
@@ -87,7 +86,7 @@ def optimise(
     edge: float,
     robust: bool = True,
 ) -> Solution:
-    """The most probable poses from the given ones. held: scans that don't move, at least one; edge: typical, for scale."""
+    """The most probable poses from the given ones. held: scans that don't move; edge: typical, for scale."""
     import gtsam
 
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
