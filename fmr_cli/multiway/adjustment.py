@@ -9,7 +9,7 @@ import numpy as np
 
 from fmr_cli.cloud import angle_degrees
 from fmr_cli.geometry.frames import leave_frames
-from fmr_cli.multiway import joint, looks, pose_graph
+from fmr_cli.multiway import consistency, joint, looks, pose_graph, visibility
 from fmr_cli.multiway.consistency import AGREE, Component, Join
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Apart, Network, Placed
@@ -199,7 +199,11 @@ def judged(survey: Survey, link: Link) -> Link:
             float(np.linalg.norm(link.T_target_source[:3, 3] - network[:3, 3])),
         )
     elif link.status == "aligned":
-        return replace(link, status="rejected", message=said(link, "too much speaks against joining its components"))
+        link = replace(link, status="rejected", message=said(link, "too much speaks against joining its components"))
+    if link.status == "rejected" and consistency.from_one_place(list(survey.links.values())):
+        share = link.hypotheses[0].seen_through
+        if share > visibility.CONTRADICTED:
+            link.message = said(link, f"one scan sees through {share:.1%} of the other there")
     return link
 
 

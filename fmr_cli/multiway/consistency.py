@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fmr_cli.multiway.links import Link
+from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.looks import displacement
+from fmr_cli.multiway.visibility import ONE_PLACE, doubt
 
 AGREE = 4.0  # voxel edges, root mean square over a scan, that poses of one link or cycle may differ by
 CHANCE = 0.05  # that a wrong hypothesis agrees with another by accident, or since a place repeats itself
@@ -23,6 +24,7 @@ DENIALS = (
     (0.5, 3.0),
     (0.3, 1.0),
 )  # at so much overlap a link that found nothing is e^-x as likely if the join is right
+RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
 CERTAIN = 12.0  # log odds, at most, of one hypothesis
 
 
@@ -55,9 +57,20 @@ class Claim:
     log_odds: float
 
 
-def log_odds(confidence: float) -> float:
-    c = min(max(confidence, 1e-9), 1 - 1e-9)
-    return float(np.clip(np.log(c / (1 - c)), -CERTAIN, CERTAIN))
+def log_odds(h: Hypothesis, one_place: bool) -> float:
+    """Of one hypothesis: what ``align`` says, less what one scan sees through at it, where that tells anything."""
+    c = min(max(h.confidence, 1e-9), 1 - 1e-9)
+    return float(np.clip(np.log(c / (1 - c)), -CERTAIN, CERTAIN)) - (doubt(h.seen_through) if one_place else 0.0)
+
+
+def from_one_place(links: list[Link]) -> bool:
+    """Whether scans were taken from one place each, so that what they see through tells: by each scan's best link."""
+    least: dict[int, float] = {}
+    for link in links:
+        if link.status == "aligned" and link.start != "known":
+            for end in link.ends:
+                least[end] = min(least.get(end, 1.0), link.hypotheses[0].seen_through)
+    return bool(least) and float(np.median(list(least.values()))) <= ONE_PLACE
 
 
 def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
@@ -67,6 +80,8 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
         if link.hypotheses:
             by_scan[link.source][link.target].append(number)
             by_scan[link.target][link.source].append(number)
+    one_place = from_one_place(links)
+    alone = [[log_odds(h, one_place) for h in link.hypotheses] for link in links]
     found = []
     for number, link in enumerate(links):
         i, j = link.ends
@@ -74,19 +89,17 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
             support = 0.0
             for k in sorted(by_scan[i].keys() & by_scan[j].keys()):
                 best = 0.0
-                for a in (links[n] for n in by_scan[i][k]):
-                    for b in (links[n] for n in by_scan[k][j]):
+                for m in by_scan[i][k]:
+                    for n in by_scan[k][j]:
+                        a, b = links[m], links[n]
                         reach = AGREE * 1.5 * max(link.edge, a.edge, b.edge)
                         T_ki, T_jk = poses_along(a, i, k), poses_along(b, k, j)
                         off = displacement(T_jk[:, None] @ T_ki[None], h.T_target_source, moments[i])
-                        odds = [
-                            [log_odds(x.confidence) + log_odds(y.confidence) for x in a.hypotheses]
-                            for y in b.hypotheses
-                        ]
-                        agreed = np.where(off < reach, np.array(odds) - np.log(CHANCE), 0.0)
+                        odds = np.add.outer(alone[n], alone[m])
+                        agreed = np.where(off < reach, odds - np.log(CHANCE), 0.0)
                         best = max(best, float(agreed.max()))
                 support += best
-            found.append(Claim(number, choice, log_odds(h.confidence) + min(support, CERTAIN)))
+            found.append(Claim(number, choice, alone[number][choice] + min(support, CERTAIN)))
     return found
 
 
@@ -194,7 +207,7 @@ def best_join(
     best: list[Join] = []
     taken = np.zeros(len(ranked), bool)
     for lead in range(len(ranked)):
-        if taken[lead] or len(best) == 4:
+        if taken[lead] or len(best) == RIVALS:
             continue
         agreed: dict[int, float] = {}
         for k, claim in enumerate(ranked):
@@ -208,9 +221,7 @@ def best_join(
         score = ranked[lead].log_odds
         score += sum(max(x - np.log(CHANCE), 0.0) for n, x in agreed.items() if n != ranked[lead].link)
         denied = 0
-        for number in tried:
-            if number in agreed:
-                continue
+        for number in [n for n in tried if n not in agreed][:DENIERS]:
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
             T = T_join[lead] if A is first else np.linalg.inv(T_join[lead])

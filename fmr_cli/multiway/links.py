@@ -23,10 +23,14 @@ Status = Literal["aligned", "uncertain", "failed", "rejected"]
 
 @dataclass
 class Hypothesis:
-    """A pose that may be right: T_target_source (4, 4) between the centred frames; confidence: that it is."""
+    """A pose that may be right: T_target_source (4, 4) between the centred frames; confidence: that it is.
+
+    seen_through: the share of one scan that the other one sees through there (``visibility``), 0 where nobody looked.
+    """
 
     T_target_source: np.ndarray
     confidence: float
+    seen_through: float = 0.0
 
 
 @dataclass

@@ -24,7 +24,7 @@ from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.frames import Frame, enter_frames, leave_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.io.files import check_writable, reason
-from fmr_cli.multiway import adjustment, consistency, looks, pose_graph
+from fmr_cli.multiway import adjustment, consistency, looks, pose_graph, visibility
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of
 from fmr_cli.multiway.links import Hypothesis, Journal, Link, best_of, key_of, register
@@ -38,6 +38,7 @@ from fmr_cli.registration.result import plain
 FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
 NEIGHBOURS = 16  # that most resemble a scan as places, looked at where there are more pairs than that
 PROMISING = 0.15  # a look's promise from which a pair is worth registering: pairs without overlap hardly reach it
+ROUGHLY_ONE_PLACE, ROUGHLY_CONTRADICTED = 0.015, 0.03  # as visibility.ONE_PLACE, CONTRADICTED, at a look's rough pose
 FIRST, NEXT = 3, 3  # promising pairs of a scan that are registered in the first round, of a component in each later one
 ROUNDS = 12  # of joining components, at most
 CONFIRMED = 3  # links of a scan that stop the search for more
@@ -121,6 +122,8 @@ class Survey:
         self.failed: set[int] = set()
         self.edges: dict[int, float] = {}
         self.described: dict[tuple[int, float], looks.Description] = {}
+        self.views: dict[int, visibility.Viewed] = {}
+        self.judged: dict[int, Hypothesis] = {}  # hypotheses whose views are compared, by identity
         self.looks: dict[tuple[int, int], looks.Look] = {}
         self.links: dict[tuple[int, int], Link] = {}
         self.tried: set[tuple[int, int, str]] = set()
@@ -289,8 +292,26 @@ class Survey:
                     mine = sorted((p for p in pairs if i in p), key=lambda p: (-alike[place[p[0]], place[p[1]]], p))
                     near.update(mine[:NEIGHBOURS])
                 pairs = sorted(near)
-            for pair, look in zip(pairs, self.each("looking", self.look, pairs), strict=True):
-                self.looks[pair] = look
+            self.looks = dict(zip(pairs, self.each("looking", self.look, pairs), strict=True))
+        with self.stage("see through"):
+            self.each("finding viewpoints", self.viewed, numbers)
+            self.discount_what_is_seen_through()
+
+    def discount_what_is_seen_through(self) -> None:
+        """Makes looks less promising where one scan sees through the other; a look's pose is rough, so not by much.
+
+        Nothing is changed where even each scan's best look is contradicted: such scans weren't taken from one place.
+        """
+        pairs = [p for p, x in self.looks.items() if x.promise >= PROMISING]
+        shares = self.each("comparing views", lambda p: self.seen_through(*p, self.looks[p].T_target_source), pairs)
+        least: dict[int, float] = {}
+        for pair, share in zip(pairs, shares, strict=True):
+            for n in pair:
+                least[n] = min(least.get(n, 1.0), share)
+        if least and float(np.median(list(least.values()))) <= ROUGHLY_ONE_PLACE:
+            for pair, share in zip(pairs, shares, strict=True):
+                factor = 1 / (1 + (share / ROUGHLY_CONTRADICTED) ** 2)
+                self.looks[pair] = replace(self.looks[pair], promise=factor * self.looks[pair].promise)
 
     def look(self, pair: tuple[int, int]) -> looks.Look:
         edge = max(self.pair_edge(*pair), 1e-300)
@@ -299,6 +320,14 @@ class Survey:
         return (
             found if self.allowed(pair[0], pair[1], found.T_target_source) else looks.Look(0.0, found.T_target_source)
         )
+
+    def viewed(self, number: int) -> visibility.Viewed:
+        if number not in self.views:
+            self.views[number] = visibility.view(self.store.prepared(number), self.edges[number])
+        return self.views[number]
+
+    def seen_through(self, source: int, target: int, T_target_source: np.ndarray) -> float:
+        return visibility.contradiction(self.viewed(source), self.viewed(target), T_target_source)
 
     def pair_edge(self, source: int, target: int) -> float:
         from fmr_cli.registration.prepared import pair_edge
@@ -378,6 +407,12 @@ class Survey:
                 if link.hypotheses and not kept:
                     link = replace(link, status="uncertain", message="no pose within the known poses and --max-shift")
                 self.keep(replace(link, hypotheses=kept))
+        with self.stage("see through"):
+            new = [(link, h) for link in self.links.values() for h in link.hypotheses if id(h) not in self.judged]
+            shares = self.each("comparing views", lambda x: self.seen_through(*x[0].ends, x[1].T_target_source), new)
+            for (_, h), share in zip(new, shares, strict=True):
+                h.seen_through = share
+                self.judged[id(h)] = h
         with self.stage("join"):
             self.join()
 
