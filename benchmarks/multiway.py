@@ -78,7 +78,7 @@ def furnish(scene: Scene, rng: np.random.Generator, corner: np.ndarray, size: np
 def building(rng: np.random.Generator) -> tuple[Scene, list[np.ndarray]]:
     """Two corridors at a right angle with 16 offices along them, and 40 places to scan from.
 
-    Each office is scanned from its middle and from just inside its open door, the corridors from between two doors and
+    Each office is scanned from its middle and from the threshold of its open door, the corridors from between two doors and
     from where they meet.
     """
     scene, eyes = Scene(), []
@@ -101,17 +101,18 @@ def building(rng: np.random.Generator) -> tuple[Scene, list[np.ndarray]]:
                 corner, size = np.minimum(low, high), np.abs(high - low)
                 furnish(scene, rng, corner, size, side)
                 middle = turned([(k + 0.5) * ROOM, y + side * DEPTH * 0.55]) + rng.normal(0, 0.3, 2)
-                inside = turned([(k + 0.5) * ROOM, y + side * 0.6]) + rng.normal(0, 0.05, 2)
-                eyes += [np.array([*p, 1.6 + rng.normal(0, 0.05)]) for p in (middle, inside)]
+                threshold = turned([(k + 0.5) * ROOM, y]) + rng.normal(0, 0.05, 2)
+                eyes += [np.array([*p, 1.6 + rng.normal(0, 0.05)]) for p in (middle, threshold)]
         stands = [turned([d, 0]) for d in doors]
         if wing == 0:
             stands[2] = np.array([CORNER[0], 0.0])  # where the corridors meet, instead of between two doors
         eyes += [np.array([*(stand + rng.normal(0, 0.1, 2)), 1.6]) for stand in stands]
-        for k in range(2 * count):  # what hangs and stands in a corridor
-            side = rng.choice([-1, 1])
-            at = turned([(k + rng.uniform(0.1, 0.3)) * ROOM / 2, side * (CORRIDOR / 2 - 0.1)])
-            half = rng.uniform([0.1, 0.1, 0.1], [0.3, 0.12, 0.5])
-            scene.add(CUBE, [*at, rng.uniform(0.5, 1.8)], half)
+        for k in range(6 * count):  # what hangs and stands in a corridor, clear of the doors: cabinets, benches, boards
+            side, along = rng.choice([-1, 1]), rng.uniform(0.05, 0.37) + 0.5 * (k % 2)
+            half = rng.uniform([0.15, 0.08, 0.15], [0.5, 0.25, 0.8])
+            at = turned([(k // 6 + 0.02 + along) * ROOM, side * (CORRIDOR / 2 - half[1])])
+            low = half[2] if rng.random() < 0.6 else rng.uniform(half[2], HEIGHT - half[2])
+            scene.add(CUBE, [*at, low], half if wing == 0 else half[[1, 0, 2]])
         wall(scene, turned([length, -CORRIDOR / 2]), turned([length, CORRIDOR / 2]))
     wall(scene, np.array([CORNER[0] - CORRIDOR / 2, -CORRIDOR / 2]), np.array([0, -CORRIDOR / 2]))
     wall(scene, np.array([CORNER[0] - CORRIDOR / 2, -CORRIDOR / 2]), np.array([CORNER[0] - CORRIDOR / 2, CORNER[1]]))

@@ -20,8 +20,9 @@ class Placed:
     status: "placed", "unplaced" (no sure link to another one), "failed" (cannot be read or registered at all).
     component: from 0, the largest first, or None. T_component_scan: (4, 4) float64, file's coordinates of the scan to
     its component's frame, or None; T_component_scan_graph: the same before the joint refinement. links: how many join
-    it. residual: root mean square point-to-plane distance to the scans it overlaps, file's unit. covariance: (6, 6) of a twist (rotation, translation) about the scan's mean, in the
-    scan's axes, relative to the component's frame; sigma_rot_deg, sigma_shift: its largest standard deviations.
+    it. residual: root mean square point-to-plane distance to the scans it overlaps, file's unit. covariance: (6, 6) of
+    a twist (rotation, translation) about the scan's mean, in the scan's axes, relative to the component's frame;
+    sigma_rot_deg, sigma_shift: its largest standard deviations.
     """
 
     name: str

@@ -38,7 +38,7 @@ from fmr_cli.registration.result import plain
 FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
 NEIGHBOURS = 16  # that most resemble a scan as places, looked at where there are more pairs than that
 PROMISING = 0.15  # a look's promise from which a pair is worth registering: pairs without overlap hardly reach it
-ROUGHLY_ONE_PLACE, ROUGHLY_CONTRADICTED = 0.015, 0.03  # as visibility.ONE_PLACE, CONTRADICTED, at a look's rough pose
+ROUGHLY_ONE_PLACE, ROUGHLY_CONTRADICTED = 0.006, 0.012  # as visibility.ONE_PLACE, CONTRADICTED, at a look's rough pose
 FIRST, NEXT = 3, 3  # promising pairs of a scan that are registered in the first round, of a component in each later one
 ROUNDS = 12  # of joining components, at most
 CONFIRMED = 3  # links of a scan that stop the search for more
