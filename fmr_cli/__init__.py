@@ -25,6 +25,8 @@ _HOME = {
     "align_batch": "fmr_cli.batch",
     "align_sequence": "fmr_cli.sequence",
     "SequenceOptions": "fmr_cli.sequence",
+    "align_many": "fmr_cli.multiway",
+    "Network": "fmr_cli.multiway",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -19,6 +19,7 @@ from fmr_cli.cli.batch import batch_command
 from fmr_cli.cli.console import BAD_INPUT, complain
 from fmr_cli.cli.evaluate import evaluate_command
 from fmr_cli.cli.info import info_command
+from fmr_cli.cli.multiway import multiway_command
 from fmr_cli.cli.options import Debug, takes_debug
 from fmr_cli.cli.sequence import sequence_command
 from fmr_cli.cli.train import train_command
@@ -33,6 +34,7 @@ app = typer.Typer(
 COMMANDS: dict[str, Callable[..., None]] = {
     "align": align_command,
     "batch": batch_command,
+    "multiway": multiway_command,
     "sequence": sequence_command,
     "info": info_command,
     "transform": transform_command,

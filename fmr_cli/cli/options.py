@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import Field, fields
 from inspect import Parameter
 from typing import Annotated, Any
@@ -29,15 +29,19 @@ def registration_parameter(f: Field) -> Parameter:
     return Parameter(f.name, Parameter.KEYWORD_ONLY, default=f.default, annotation=Annotated[kind, info])
 
 
-def takes_registration_options(command: Callable) -> Callable:
-    """Gives a command every option of a registration; they come to it as one argument, ``options``."""
-    names = [f.name for f in fields(Options)]
+def takes_registration_options(
+    command: Callable, names: Sequence[str] = tuple(f.name for f in fields(Options))
+) -> Callable:
+    """Gives a command the options of a registration, or those named; they come to it as one argument, ``options``."""
 
     def run(**given: Any) -> None:
         chosen = {name: given.pop(name) for name in names}
-        command(**given, options=Options(**chosen | {"init": read_init(chosen["init"])}))
+        if "init" in chosen:
+            chosen["init"] = read_init(chosen["init"])
+        command(**given, options=Options(**chosen))
 
-    return with_parameters(command, run, [registration_parameter(f) for f in fields(Options)], without="options")
+    more = [registration_parameter(f) for f in fields(Options) if f.name in names]
+    return with_parameters(command, run, more, without="options")
 
 
 def takes_debug(command: Callable) -> Callable:

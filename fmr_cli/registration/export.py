@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,16 +31,27 @@ def aligned_cloud(source: PointCloud, target: PointCloud, T: np.ndarray) -> Poin
 
 
 def merged_cloud(source: PointCloud, target: PointCloud, T: np.ndarray) -> tuple[PointCloud, list[str]]:
-    """Both clouds in the target's frame with ``source_id`` (0 source, 1 target), and warnings about attributes.
+    """Both clouds in the target's frame with ``source_id`` (0 source, 1 target), and warnings about attributes."""
+    merged, warnings = merged_clouds([source.transformed(T), target], "source_id")
+    return replace(
+        merged, path=target.path, format=target.format, dropped=target.dropped, left_out=target.left_out,
+        crs=target.crs or source.crs, las_header=target.las_header or source.las_header,
+    ), warnings  # fmt: skip
 
-    An attribute that only one of them has is 0 for the other's points; one of two widths is left out.
+
+def merged_clouds(
+    clouds: Sequence[PointCloud], label: str, numbers: Sequence[int] | None = None
+) -> tuple[PointCloud, list[str]]:
+    """Clouds of one frame in one, each point with its cloud's number as attribute ``label``; and warnings.
+
+    numbers: by default the clouds' places in the list. An attribute that some of them lack is 0 for their points; one
+    of two widths is left out. CRS and LAS header are those of the first that has them.
     """
-    clouds = (source.transformed(T), target)
     attributes, warnings = {}, []
-    for name in dict.fromkeys([*clouds[0].attributes, *target.attributes]):
+    for name in dict.fromkeys(name for cloud in clouds for name in cloud.attributes):
         present = [cloud.attributes[name] for cloud in clouds if name in cloud.attributes]
         if len({values.shape[1:] for values in present}) > 1:
-            warnings.append(f"attribute {name!r} has a different width in the two clouds: left out of the merged cloud")
+            warnings.append(f"attribute {name!r} has not one width in all clouds: left out of the merged cloud")
             continue
         parts = [
             cloud.attributes[name] if name in cloud.attributes else np.zeros((len(cloud), *present[0].shape[1:]), "u1")
@@ -48,15 +60,17 @@ def merged_cloud(source: PointCloud, target: PointCloud, T: np.ndarray) -> tuple
         if name in COLOURS and {values.dtype for values in present} == {np.dtype(np.uint8), np.dtype(np.uint16)}:
             parts = [part.astype(np.uint16) * 257 if part.dtype == np.uint8 else part for part in parts]
         attributes[name] = np.concatenate([part.astype(np.result_type(*present), copy=False) for part in parts])
-        if len(present) == 1:
-            lacking = next(cloud for cloud in (source, target) if name not in cloud.attributes)
-            warnings.append(f"attribute {name!r} is not in {lacking.name}: 0 for its points in the merged cloud")
-    attributes["source_id"] = np.repeat(np.array([0, 1], np.uint8), [len(source), len(target)])
+        lacking = [cloud.name for cloud in clouds if name not in cloud.attributes]
+        if lacking:
+            who = lacking[0] if len(lacking) == 1 else f"{lacking[0]} and {len(lacking) - 1} more"
+            warnings.append(f"attribute {name!r} is not in {who}: 0 for their points in the merged cloud")
+    ids = np.arange(len(clouds)) if numbers is None else np.asarray(numbers)
+    small = np.uint8 if ids.max() < 256 else np.uint16
+    attributes[label] = np.repeat(ids.astype(small), [len(cloud) for cloud in clouds])
+    crs = next((cloud.crs for cloud in clouds if cloud.crs), None)
+    header = next((cloud.las_header for cloud in clouds if cloud.las_header is not None), None)
     points = np.concatenate([cloud.points for cloud in clouds])
-    return replace(
-        target, points=points, attributes=attributes, sensor_origin=None,
-        crs=target.crs or source.crs, las_header=target.las_header or source.las_header,
-    ), warnings  # fmt: skip
+    return PointCloud(points, attributes, crs=crs, las_header=header), warnings
 
 
 def metrics(source: PointCloud, target: PointCloud, found: Registration) -> dict[str, Any]:

@@ -11,7 +11,9 @@ import fmr_cli
 def test_help_names_the_commands(fmr):
     done = fmr("--help")
     assert done.returncode == 0
-    assert {"align", "batch", "sequence", "info", "transform", "train", "evaluate"} <= set(done.stdout.split())
+    assert {"align", "batch", "multiway", "sequence", "info", "transform", "train", "evaluate"} <= set(
+        done.stdout.split()
+    )
 
 
 def test_version(fmr):

@@ -1,0 +1,166 @@
+"""A link: what registering two scans of a network has given, with every pose that may be right; and its journal."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import threading
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from fmr_cli.errors import FmrError, ModelError
+from fmr_cli.geometry.frames import enter_frames
+from fmr_cli.io.files import reason
+from fmr_cli.multiway.store import Store
+from fmr_cli.registration import Options, align
+
+Status = Literal["aligned", "uncertain", "failed", "rejected"]
+
+
+@dataclass
+class Hypothesis:
+    """A pose that may be right: T_target_source (4, 4) between the centred frames; confidence: that it is.
+
+    seen_through: the share of one scan that the other one sees through there (``visibility``), 0 where nobody looked.
+    """
+
+    T_target_source: np.ndarray
+    confidence: float
+    seen_through: float = 0.0
+
+
+@dataclass
+class Link:
+    """Two scans, by number, and what registering them has given.
+
+    status: as ``align`` says, "failed" where it could not, "rejected" where the network has thrown it out.
+    start: "features", "auto", "pose" (from where the network had it), "known" (given, not registered).
+    hypotheses: best first. information: (6, 6) of a twist (rotation, translation) in the target's centred frame.
+    chosen: the hypothesis that agrees with the network, or None.
+    """
+
+    source: int
+    target: int
+    status: Status
+    start: str
+    hypotheses: list[Hypothesis] = field(default_factory=list)
+    information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    overlap: float = 0.0
+    inlier_rmse: float = 0.0
+    edge: float = 0.0
+    message: str = ""
+    chosen: int | None = None
+    residual_rot_deg: float = float("nan")
+    residual_shift: float = float("nan")
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        return self.source, self.target
+
+    @property
+    def confidence(self) -> float:
+        return self.hypotheses[0].confidence if self.hypotheses else 0.0
+
+    @property
+    def T_target_source(self) -> np.ndarray:  # noqa: N802 (the field's name for it)
+        """The pose that the network has chosen, or the most confident one."""
+        return self.hypotheses[self.chosen or 0].T_target_source
+
+
+def register(store: Store, source: int, target: int, start: str, options: Options) -> Link:
+    """One pair through ``align``; whatever it runs into becomes a failed link. Raises ModelError alone."""
+    try:
+        a, b = store.prepared(source), store.prepared(target)
+        found = align(a, b, options, threads=1)
+        poses = [(found.T_target_source, found.confidence)]
+        poses += [(np.array(x["T_target_source"]), x["confidence"]) for x in found.alternatives]
+        hypotheses = [Hypothesis(enter_frames(T, a.frame, b.frame), float(c)) for T, c in poses]
+        return Link(
+            source, target, found.status, start, hypotheses,
+            found.information, found.overlap, found.inlier_rmse, found.voxel_size, "; ".join(found.undetermined),
+        )  # fmt: skip
+    except ModelError:
+        raise
+    except FmrError as error:
+        return Link(source, target, "failed", start, message=" ".join(str(error).split()))
+    except Exception as error:  # whatever one pair runs into, the others go on
+        return Link(source, target, "failed", start, message=f"{type(error).__name__}: {reason(error)}")
+
+
+def best_of(first: Link | None, second: Link) -> Link:
+    """One link of two attempts at a pair: the more confident, with the poses that only the other one has."""
+    if first is None:
+        return second
+    a, b = (first, second) if first.confidence >= second.confidence else (second, first)
+    more = [h for h in b.hypotheses if all(apart(h, k, a.edge or b.edge) for k in a.hypotheses)]
+    return replace(a, hypotheses=[*a.hypotheses, *more])
+
+
+def apart(a: Hypothesis, b: Hypothesis, edge: float) -> bool:
+    """Whether two poses are two: ten degrees or four voxel edges, as ``align`` tells its candidates apart."""
+    A, B = a.T_target_source, b.T_target_source
+    cosine = (np.trace(A[:3, :3].T @ B[:3, :3]) - 1) / 2
+    return bool(cosine < np.cos(np.radians(10)) or np.linalg.norm(A[:3, 3] - B[:3, 3]) > 4 * edge)
+
+
+class Journal:
+    """What registering has given so far, a line an attempt, so that a kill loses none; path: None keeps it in memory.
+
+    settings: what all attempts share; a journal made with others is refused by its caller.
+    """
+
+    def __init__(self, path: Path | None, settings: dict[str, Any]) -> None:
+        self.path, self.settings = path, settings
+        self.known: dict[str, dict[str, Any]] = {}
+        self.lock = threading.Lock()
+
+    def read(self) -> dict[str, Any] | None:
+        """Reads what is there, without a last line that a kill has torn; returns its settings, or None."""
+        if self.path is None or not self.path.exists():
+            return None
+        whole = self.path.read_bytes()
+        whole = whole[: whole.rfind(b"\n") + 1]
+        os.truncate(self.path, len(whole))
+        lines = whole.decode("utf-8").splitlines()
+        if not lines:
+            return None
+        for line in lines[1:]:
+            entry = json.loads(line)
+            self.known[entry.pop("key")] = entry
+        return json.loads(lines[0])
+
+    def begin(self) -> None:
+        """Writes the settings as the first line of a new journal."""
+        if self.path is not None:
+            self.path.write_text(json.dumps(self.settings) + "\n", "utf-8")
+
+    def recall(self, key: str) -> Link | None:
+        entry = self.known.get(key)
+        if entry is None:
+            return None
+        poses = [Hypothesis(np.array(T), c) for T, c in entry["hypotheses"]]
+        return Link(**{**entry, "hypotheses": poses, "information": np.array(entry["information"])})
+
+    def keep(self, key: str, link: Link) -> None:
+        """Puts an attempt on disk."""
+        if self.path is None:
+            return
+        names = ("source", "target", "status", "start", "overlap", "inlier_rmse", "edge", "message")
+        entry = {name: getattr(link, name) for name in names}
+        entry |= {"hypotheses": [(h.T_target_source.tolist(), h.confidence) for h in link.hypotheses]}
+        entry |= {"key": key, "information": link.information.tolist()}
+        with self.lock, self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def key_of(source: int, target: int, start: str, options: Options) -> str:
+    """What names an attempt: the scans, the kind of start and, for a given pose, its bits."""
+    init = options.init
+    digest = "" if isinstance(init, str) else hashlib.sha256(np.asarray(init, float).tobytes()).hexdigest()[:16]
+    return f"{source} {target} {start} {digest}"

@@ -1,0 +1,106 @@
+"""Which scans: files, folders and lists of files as one list in natural order, each with a name of its own."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fmr_cli.batch.manifest import numbered, safe
+from fmr_cli.cloud import PointCloud
+from fmr_cli.errors import CloudFileError, FmrError
+from fmr_cli.io.files import check_readable
+from fmr_cli.io.folders import find_scans
+
+LISTS = (".lst", ".list")  # and a .txt whose first line names a file
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One scan to place. name: unique among all, safe as a file name. source: its file, or a cloud in memory."""
+
+    name: str
+    source: Path | PointCloud
+
+    @property
+    def path(self) -> Path | None:
+        return self.source if isinstance(self.source, Path) else self.source.path
+
+
+def list_scans(given: Iterable[str | Path | PointCloud], out: Path | None = None) -> list[Scan]:
+    """The scans of files, folders, text files that list scans, and clouds in memory, in natural order of their names.
+
+    Equal stems are told apart by their folders. ``out``: a folder whose files are no scans. Raises FmrError where a
+    path is not there or fewer than two scans are.
+    """
+    sources: list[Path | PointCloud] = []
+    for item in given:
+        if isinstance(item, PointCloud):
+            sources.append(item)
+            continue
+        path = Path(item)
+        if path.is_dir():
+            sources += [
+                file for file in find_scans([path]) if out is None or out.resolve() not in file.resolve().parents
+            ]
+        elif is_list(path):
+            sources += in_list(path)
+        else:
+            check_readable(path)
+            sources.append(path)
+    if len(sources) < 2:
+        where = ", ".join(str(item) for item in given if not isinstance(item, PointCloud)) or "the list of clouds"
+        raise FmrError(
+            f"{where}: {'one scan' if sources else 'no scan'} only, a network has two or more; give more files"
+        )
+    named = [Scan(name, source) for name, source in zip(names(sources), sources, strict=True)]
+    return sorted(named, key=lambda scan: natural(scan.name))
+
+
+def is_list(path: Path) -> bool:
+    """Whether a file lists scans: by its suffix, or a .txt whose first line names a file."""
+    if path.suffix.lower() in LISTS:
+        return True
+    if path.suffix.lower() != ".txt" or not path.is_file():
+        return False
+    with path.open(encoding="utf-8", errors="replace") as file:
+        line = next((text for text in file if text.strip() and not text.lstrip().startswith("#")), "")
+    return (path.parent / line.split("#")[0].strip()).is_file()
+
+
+def in_list(path: Path) -> list[Path]:
+    """The files that a text file names, one a line, relative to it; # begins a comment. Raises CloudFileError."""
+    check_readable(path)
+    lines = (line.split("#")[0].strip() for line in path.read_text("utf-8", errors="replace").splitlines())
+    files = [path.parent / line for line in lines if line]
+    missing = next((file for file in files if not file.is_file()), None)
+    if missing or not files:
+        what = f"lists {missing}, which is not there" if missing else "lists no scans"
+        raise CloudFileError(f"{path}: {what}; name one scan file a line")
+    return files
+
+
+def names(sources: Sequence[Path | PointCloud]) -> list[str]:
+    """A name for each: its stem, with as many of its folders (then its suffix) as tell equal ones apart."""
+    paths = [source if isinstance(source, Path) else source.path for source in sources]
+    found = [path.stem if path else f"cloud_{number:03d}" for number, path in enumerate(paths)]
+    for depth in (1, 2, 3):
+        count = Counter(name.casefold() for name in found)
+        for number, path in enumerate(paths):
+            if path and count[found[number].casefold()] > 1:
+                folders = path.resolve().parent.parts[-depth:]
+                found[number] = "_".join([*folders, path.stem if depth < 3 else path.name])
+    taken: set[str] = set()
+    unique = []
+    for name in map(safe, found):
+        unique.append(next(free for free in numbered(name) if free.casefold() not in taken))
+        taken.add(unique[-1].casefold())
+    return unique
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """A key that puts scan2 before scan10."""
+    return [(0, int(part), "") if part.isdecimal() and part.isascii() else (1, 0, part.casefold())
+            for part in re.split(r"([0-9]+)", name) if part]  # fmt: skip

@@ -1,0 +1,187 @@
+"""`fmr multiway`: a pose for each scan and a word on each link, whatever happens to the process."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from rooms import room_views
+
+from fmr_cli import PointCloud, read_cloud, write_cloud
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    return room_views(3, 4, points=6_000)
+
+
+@pytest.fixture
+def folder(tmp_path, clouds):
+    (tmp_path / "scans").mkdir()
+    for n, points in enumerate(clouds[0]):
+        grey = np.full(len(points), n, np.uint8)
+        write_cloud(tmp_path / "scans" / f"s{n}.ply", PointCloud(points, {"intensity": grey}))
+    return tmp_path
+
+
+def table(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def result(folder):
+    """Everything a run has written but its times and its journal, by file."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in ("journal.jsonl", "network.json"))
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+
+def test_what_is_written(fmr, folder, clouds, worst_pose):
+    done = fmr("multiway", "scans", "--out", "out", "--merged", "all.ply", "--aligned", "--anchor", "s2", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "4 of 4 scans placed" in done.stderr
+    scans = table(folder / "out" / "scans.csv")
+    assert [row["scan"] for row in scans] == ["s0", "s1", "s2", "s3"]
+    assert {row["status"] for row in scans} == {"placed"}
+    assert {row["component"] for row in scans} == {"0"}
+    poses = [np.loadtxt(folder / "out" / row["pose"]) for row in scans]
+    assert np.array_equal(poses[2], np.eye(4))
+    assert worst_pose(poses, clouds[1]) < 0.03
+    links = table(folder / "out" / "links.csv")
+    assert {row["status"] for row in links} <= {"aligned", "uncertain", "failed", "rejected"}
+    by_name = {row["scan"]: pose for row, pose in zip(scans, poses, strict=True)}
+    for row in links:
+        if row["status"] == "aligned":
+            T = np.loadtxt(folder / "out" / row["transform"])
+            network = np.linalg.inv(by_name[row["target"]]) @ by_name[row["source"]]
+            assert np.linalg.norm((T - network)[:3, :3]) < 0.1
+            assert float(row["residual_rot_deg"]) < 3
+    network = json.loads((folder / "out" / "network.json").read_text())
+    assert network["components"] == [{"anchor": "s2", "scans": ["s0", "s1", "s2", "s3"]}]
+    g2o = (folder / "out" / "network.g2o").read_text().splitlines()
+    assert sum(line.startswith("VERTEX_SE3:QUAT") for line in g2o) == 4
+    assert all(len(line.split()) == 31 for line in g2o if line.startswith("EDGE_SE3:QUAT"))
+    merged = read_cloud(folder / "all.ply")
+    assert np.array_equal(merged.attributes["scan_id"], merged.attributes["intensity"])
+    assert len(merged) == sum(map(len, clouds[0]))
+    moved = read_cloud(folder / "out" / "aligned" / "s1.ply")
+    expected = clouds[0][1] @ poses[1][:3, :3].T + poses[1][:3, 3]
+    assert np.allclose(moved.points, expected)
+
+
+@pytest.fixture
+def worst_pose():
+    def worst(poses, truth):
+        return max(
+            np.linalg.norm((np.linalg.inv(poses[0]) @ T - np.linalg.inv(truth[0]) @ true)[:3, 3])
+            for T, true in zip(poses, truth, strict=True)
+        )
+
+    return worst
+
+
+def test_gtsam_reads_the_graph(fmr, folder):
+    import gtsam
+
+    assert fmr("multiway", "scans", "--out", "out", "-q", cwd=folder).returncode == 0
+    graph, values = gtsam.readG2o(str(folder / "out" / "network.g2o"), True)
+    assert values.size() == 4
+    found = gtsam.LevenbergMarquardtOptimizer(
+        anchored(graph, values, gtsam), values
+    ).optimize()  # moves little: the graph's links are those of the network
+    for n in range(4):
+        apart = values.atPose3(n).inverse().compose(found.atPose3(n)).translation()
+        assert np.linalg.norm(apart) < 0.05
+
+
+def anchored(graph, values, gtsam):
+    graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    return graph
+
+
+def test_a_kill_loses_no_link_and_resume_gives_the_same(fmr, folder):
+    assert fmr("multiway", "scans", "--out", "whole", "-q", cwd=folder).returncode == 0
+    journal = folder / "out" / "journal.jsonl"
+    command = [sys.executable, "-m", "fmr_cli.cli", "multiway", "scans", "--out", "out", "--workers", "1"]
+    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.DEVNULL)
+    while process.poll() is None and not (journal.exists() and journal.read_text().count("\n") >= 3):
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = journal.read_text().splitlines()
+    assert len(kept) >= 3
+    assert not (folder / "out" / "scans.csv").exists()
+    refused = fmr("multiway", "scans", "--out", "out", cwd=folder)
+    assert refused.returncode == 2
+    assert "--resume" in refused.stderr
+    assert fmr("multiway", "scans", "--out", "out", "--resume", "-q", cwd=folder).returncode == 0
+    assert journal.read_text().splitlines()[: len(kept)] == kept, "what was done is not done again"
+    assert result(folder / "out") == result(folder / "whole")
+    assert not (folder / "out" / "work").exists()
+
+
+def test_resume_refuses_other_settings(fmr, folder):
+    assert fmr("multiway", "scans", "--out", "out", "-q", cwd=folder).returncode == 0
+    before = result(folder / "out")
+    done = fmr("multiway", "scans", "--out", "out", "--resume", "--seed", "1", cwd=folder)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "other scans or settings" in done.stderr
+    assert result(folder / "out") == before
+
+
+def test_what_cannot_be_joined_is_exit_code_3_and_said(fmr, folder):
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    write_cloud(folder / "scans" / "noise.ply", PointCloud(points))
+    (folder / "scans" / "broken.ply").write_text("ply\n")
+    done = fmr("multiway", "scans", "--out", "out", "--merged", "all.ply", "--merged-voxel", 0.2, cwd=folder)
+    assert done.returncode == 3
+    assert "not placed: noise" in done.stderr
+    assert "broken failed" in done.stderr
+    rows = {row["scan"]: row for row in table(folder / "out" / "scans.csv")}
+    assert (rows["noise"]["status"], rows["noise"]["pose"], rows["noise"]["component"]) == ("unplaced", "", "")
+    assert rows["broken"]["status"] == "failed"
+    assert [rows[f"s{n}"]["status"] for n in range(4)] == ["placed"] * 4
+    assert 100 < len(read_cloud(folder / "all.ply")) < 10_000
+
+
+BAD = {
+    "one scan": (["scans/s0.ply"], "two or more"),
+    "no such file": (["scans", "nowhere.ply"], "nowhere.ply"),
+    "unknown anchor": (["scans", "--anchor", "s9"], "--anchor"),
+    "unknown fixed": (["scans", "--fixed", "s9"], "--fixed"),
+    "empty links": (["scans", "--links", "empty.csv"], "empty.csv"),
+    "bad merged": (["scans", "--merged", "all.xyzw"], "all.xyzw"),
+    "no folder": (["scans", "--out", "no/such"], "does not exist"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "said"), BAD.values(), ids=BAD)
+def test_bad_input_is_one_line_and_leaves_nothing(fmr_here, folder, arguments, said):
+    (folder / "empty.csv").write_text("source,target\n")
+    before = sorted(folder.rglob("*"))
+    out = [] if "--out" in arguments else ["--out", "out"]
+    done = fmr_here("multiway", *arguments, *out, cwd=folder)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_contradictory_fixed_poses_are_said(fmr, folder, clouds):
+    """Two scans whose files lie anywhere are told to stay there: their link contradicts that, and is named."""
+    done = fmr("multiway", "scans", "--out", "out", "--fixed", "s0", "--fixed", "s1", cwd=folder)
+    links = table(folder / "out" / "links.csv")
+    pair = next(row for row in links if {row["source"], row["target"]} == {"s0", "s1"})
+    assert pair["status"] == "rejected"
+    assert "fixed" in pair["message"]
+    assert "s1 to s0 is rejected" in done.stderr
+    rows = {row["scan"]: row for row in table(folder / "out" / "scans.csv")}
+    for name in ("s0", "s1"):
+        assert np.array_equal(np.loadtxt(folder / "out" / rows[name]["pose"]), np.eye(4))

@@ -1,0 +1,95 @@
+"""Which hypotheses of which links hold: what cycles say, what one doubtful link may not do."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fmr_cli.multiway.consistency import joined
+from fmr_cli.multiway.links import Hypothesis, Link
+
+MOMENT = np.diag([1.0, 1.0, 1.0, 1.0])
+EDGE = 0.05
+
+
+def pose(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-5, 5, 3)
+    return T
+
+
+WORLD = [pose(n) for n in range(6)]
+
+
+def link(source: int, target: int, *confidences: float, right: int | None = 0) -> Link:
+    """Hypotheses of those confidences, of which number ``right`` is true."""
+    true = np.linalg.inv(WORLD[target]) @ WORLD[source]
+    hypotheses = [
+        Hypothesis(true if k == right else pose(100 * source + 10 * target + k), c) for k, c in enumerate(confidences)
+    ]
+    status = "aligned" if confidences[0] >= 0.5 else "uncertain"
+    return Link(source, target, status, "features", hypotheses, np.eye(6), 0.5, 0.01, EDGE)
+
+
+def components(count: int, links: list[Link], overlap: float = 0.0):
+    found, apart = joined(count, links, dict.fromkeys(range(count), MOMENT), lambda i, j, T: overlap)
+    for component in found:
+        first = min(component.T_component_scan)
+        for n, T in component.T_component_scan.items():
+            expected = np.linalg.inv(WORLD[first]) @ WORLD[n]
+            component.right = np.allclose(np.linalg.inv(component.T_component_scan[first]) @ T, expected, atol=1e-6)
+    return found, apart
+
+
+def members(found):
+    return [sorted(component.T_component_scan) for component in found]
+
+
+def test_sure_links_join():
+    found, apart = components(4, [link(1, 0, 0.9), link(2, 1, 0.9)])
+    assert members(found) == [[0, 1, 2], [3]]
+    assert found[0].right
+    assert not apart
+
+
+def test_one_doubtful_link_joins_nothing_and_is_named():
+    found, apart = components(2, [link(1, 0, 0.4)])
+    assert members(found) == [[0], [1]]
+    assert apart[0, 1].links == (0,)
+    assert apart[0, 1].probability < 0.5
+
+
+def test_doubtful_links_that_agree_join():
+    links = [link(1, 0, 0.99), link(3, 2, 0.99), link(2, 0, 0.4), link(3, 1, 0.4)]
+    assert members(components(4, links)[0]) == [[0, 1, 2, 3]]
+    disagree = [*links[:3], link(3, 1, 0.4, right=None)]
+    assert members(components(4, disagree)[0]) == [[0, 1], [2, 3]]
+
+
+def test_a_cycle_chooses_among_the_poses_of_an_ambiguous_link():
+    ambiguous = link(2, 0, 0.5, 0.45, right=1)  # a place that repeats itself: the wrong pose looks a little better
+    found, _ = components(3, [link(1, 0, 0.95), link(2, 1, 0.95), ambiguous])
+    assert members(found) == [[0, 1, 2]]
+    assert found[0].right
+
+
+def test_an_ambiguous_link_alone_joins_nothing():
+    assert members(components(2, [link(1, 0, 0.48, 0.47)])[0]) == [[0], [1]]
+
+
+def test_a_wrong_link_made_first_is_outvoted():
+    wrong = link(3, 0, 0.9999, right=None)
+    links = [link(1, 0, 0.9), link(2, 1, 0.9), link(2, 0, 0.9), link(3, 1, 0.9), link(3, 2, 0.9), wrong]
+    found, _ = components(4, links)
+    assert members(found) == [[0, 1, 2, 3]]
+    assert found[0].right
+
+
+def test_pairs_that_would_overlap_and_do_not_fit_deny_a_join():
+    base = [link(1, 0, 0.99), link(3, 2, 0.99), link(2, 0, 0.8)]
+    silent = Link(3, 1, "uncertain", "pose", [Hypothesis(pose(77), 0.001)], np.eye(6), 0.1, 0.01, EDGE)
+    assert members(components(4, [*base, silent], overlap=0.0)[0]) == [[0, 1, 2, 3]]
+    found, apart = components(4, [*base, silent], overlap=0.9)
+    assert members(found) == [[0, 1], [2, 3]]
+    assert apart[0, 1].denied == 1

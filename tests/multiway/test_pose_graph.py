@@ -1,0 +1,97 @@
+"""The pose graph: exact where links are, robust where one is wrong, honest about what the others say of a link."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fmr_cli.geometry.motion import Motion, exp
+from fmr_cli.multiway.pose_graph import Factor, Prior, adjoint, bounded, optimise
+
+SIGMA = np.array([1e-3] * 3 + [1e-2] * 3)
+
+
+def world(count: int, seed: int = 0) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    poses = []
+    for _ in range(count):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-5, 5, 3)
+        poses.append(T)
+    return poses
+
+
+def factor(poses, i, j, twist=(0,) * 6) -> Factor:
+    T = exp(np.array(twist, float)) @ np.linalg.inv(poses[j]) @ poses[i]
+    return Factor(i, j, T, np.diag(1 / SIGMA**2))
+
+
+def test_the_adjoint_takes_a_twist_from_the_right_to_the_left():
+    T, xi = world(1)[0], np.array([0.1, -0.2, 0.05, 0.3, 0.2, -0.1])
+    assert np.allclose(T @ exp(xi), exp(adjoint(T) @ xi) @ T)
+
+
+def test_it_finds_exact_poses_from_rough_ones():
+    poses = world(5)
+    factors = [factor(poses, i, j) for i, j in ((1, 0), (2, 1), (3, 2), (4, 3), (4, 0))]
+    rough = {n: T @ exp(np.full(6, 0.05 * (n > 0))) for n, T in enumerate(poses)}
+    found = optimise(rough, factors, [], {0}, Motion(), 0.05)
+    for n, T in enumerate(poses):
+        assert np.allclose(found.T_component_scan[n], T, atol=1e-5)
+
+
+def test_the_covariance_is_that_of_many_draws():
+    rng, poses, draws = np.random.default_rng(1), world(3), []
+    for _ in range(200):
+        noisy = [factor(poses, i, j, rng.normal(size=6) * SIGMA) for i, j in ((1, 0), (2, 1), (2, 0))]
+        found = optimise(dict(enumerate(poses)), noisy, [], {0}, Motion(), 0.05, robust=False)
+        D = np.linalg.inv(poses[2]) @ found.T_component_scan[2]
+        draws.append(D[:3, 3])
+    expected = np.sqrt(np.trace(found.covariance[2][3:, 3:]))
+    assert np.sqrt(np.trace(np.cov(np.array(draws).T))) == pytest.approx(expected, rel=0.15)
+
+
+def test_what_the_others_say_of_a_link_is_what_they_say_without_it():
+    poses = world(4)
+    off = np.array([0.0, 0, 0, 0.02, -0.01, 0.01])
+    ends = ((1, 0), (2, 1), (3, 2), (3, 0), (2, 0))
+    factors = [factor(poses, *e, off if k == 4 else (0,) * 6) for k, e in enumerate(ends)]
+    found = optimise(dict(enumerate(poses)), factors, [], {0}, Motion(), 0.05)
+    assert np.allclose(found.apart[4], np.linalg.inv(poses[0]) @ poses[2], atol=2e-3)
+    alone = optimise(dict(enumerate(poses)), factors[:3], [], {0}, Motion(), 0.05)
+    assert alone.apart == [None, None, None], "no cycle, nothing to say"
+
+
+def test_a_gross_error_hardly_moves_the_others():
+    poses = world(4)
+    ends = ((1, 0), (2, 1), (3, 2), (3, 0), (3, 1))
+    factors = [factor(poses, *e) for e in ends] + [factor(poses, 2, 0, [0.4, 0, 0, 1.0, 0, 0])]
+    found = optimise(dict(enumerate(poses)), factors, [], {0}, Motion(), 0.05)
+    for n, T in enumerate(poses):
+        assert np.linalg.norm((found.T_component_scan[n] - T)[:3, 3]) < 0.01
+
+
+def test_a_prior_fixes_the_frame():
+    poses = world(3)
+    factors = [factor(poses, 1, 0), factor(poses, 2, 1)]
+    shifted = {n: exp(np.array([0, 0, 0.1, 1, 0, 0])) @ T for n, T in enumerate(poses)}
+    found = optimise(shifted, factors, [Prior(0, poses[0], 0.01, 0.1)], set(), Motion(), 0.05)
+    for n, T in enumerate(poses):
+        assert np.allclose(found.T_component_scan[n], T, atol=1e-4)
+
+
+def test_levelled_scans_stay_level():
+    turn = [Rotation.from_euler("z", a).as_matrix() for a in (0, 0.5, 1.0)]
+    poses = [np.block([[R, np.array([[k], [0], [0]])], [np.zeros((1, 3)), 1]]) for k, R in enumerate(turn)]
+    tilted = [factor(poses, 1, 0, [0.01, 0, 0, 0, 0, 0]), factor(poses, 2, 1), factor(poses, 2, 0)]
+    found = optimise(dict(enumerate(poses)), tilted, [], {0}, Motion("yaw"), 0.05)
+    assert max(abs(T[2, 2] - 1) for T in found.T_component_scan.values()) < 1e-7
+
+
+def test_no_link_is_surer_than_its_grid_and_none_is_without_any():
+    wide = bounded(np.zeros((6, 6)), 2.0, 0.1)
+    narrow = bounded(1e30 * np.eye(6), 2.0, 0.1)
+    assert np.sqrt(1 / wide[3, 3]) == pytest.approx(1.0)
+    assert np.sqrt(1 / narrow[3, 3]) == pytest.approx(0.002)
+    assert np.sqrt(1 / narrow[0, 0]) == pytest.approx(0.001)
