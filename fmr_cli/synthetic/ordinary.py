@@ -192,7 +192,7 @@ def street_views(low: float, high: float) -> Maker:
         first = np.array([rng.uniform(-35, -15), rng.uniform(-1.5, 1.5), 1.9])
 
         def make(rng: np.random.Generator, apart: float) -> tuple[Scan, Scan]:
-            second = first + [5 + 40 * apart, rng.uniform(-1, 1), 0]
+            second = first + np.array([5 + 40 * apart, rng.uniform(-1, 1), 0])
             scans = [sensors.lidar_scan(scene, rng, at, reach, beams, columns) for at in (first, second)]
             check_points(*scans)
             return scans[0], scans[1]

@@ -87,7 +87,7 @@ def stairs(landing: bool) -> Callable[[np.random.Generator], Draft]:
             end = last + 4.0 if landing else begin + count
             low, high = tread * (begin + rng.uniform(0, 1)), tread * (end - rng.uniform(0, 0.9))
             middle = np.array([0.45, (low + high) / 2, rise * (low + high) / 2 / tread])
-            stand = middle + [0, -rng.uniform(0.5, 1.5), rng.uniform(1.8, 2.6)]
+            stand = middle + np.array([0, -rng.uniform(0.5, 1.5), rng.uniform(1.8, 2.6)])
             scan = look(s, sensor, rng, stand, np.array([0, 1, -0.3]), BIG, log_uniform(rng, 300, 3000))
             scans.append(scan.within([-0.2, low, -BIG], [BIG, high, BIG]))
         check_points(*scans)
