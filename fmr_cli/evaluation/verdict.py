@@ -75,11 +75,11 @@ def judge(pair: VerdictPair, number: int, origins: bool = False) -> Judged:
         )  # fmt: skip
     took = time.perf_counter() - begin
     right = pair.is_right(found.T_target_source, share=RIGHT)
-    error, degrees = nees(found, pair.poses[0]) if right and pair.unique else (np.nan, 0)
+    squared, degrees = nees(found, pair.poses[0]) if right and pair.unique else (np.nan, 0)
     return Judged(
         pair.kind, number, pair.unique, len(pair.poses) > 1, right,
         pair.is_right(found.T_target_source, LOOSE_DEGREES, LOOSE), found.status, found.confidence,
-        pair.displacement(found.T_target_source), aliases_named(pair, found), error, degrees, took,
+        pair.displacement(found.T_target_source), aliases_named(pair, found), squared, degrees, took,
     )  # fmt: skip
 
 
@@ -194,11 +194,11 @@ def report(rows: Sequence[Judged]) -> str:
         named = f"{s['aliases_named']:7.2f}" if promise == "several" else "       "
         error = f"{s['nees']:7.2f}" if np.isfinite(float(str(s["nees"]))) else "       "
         lines.append(
-            f"{kind:38s} {promise:8s} {hits:2d}/{len(own):<2d}  {s['aligned']:7d}  {s['aligned_wrong']:5d}  {named} {error}"
-            f"  {s['seconds']:8.2f}"
+            f"{kind:38s} {promise:8s} {hits:2d}/{len(own):<2d}  {s['aligned']:7d}  {s['aligned_wrong']:5d}"
+            f"  {named} {error}  {s['seconds']:8.2f}"
         )
     s = summary(rows)
-    curve, error = reliability(rows)
+    curve, calibration = reliability(rows)
     lines += [
         "",
         f"precision of aligned {s['precision']:.3f} ({s['aligned_wrong']} wrong of {s['aligned']}; "
@@ -213,5 +213,5 @@ def report(rows: Sequence[Judged]) -> str:
         f"{b['low']:.1f} to {b['low'] + 1 / BINS:.1f}  {b['pairs']:6d}  {b['confidence']:.3f}  {b['right']:.3f}"
         for b in curve
     ]
-    lines.append(f"expected calibration error {error:.3f}")
+    lines.append(f"expected calibration error {calibration:.3f}")
     return "\n".join(lines)
