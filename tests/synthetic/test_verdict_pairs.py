@@ -50,7 +50,7 @@ def test_a_pair_is_what_it_says(pairs, kind):
         assert 300 <= len(points) <= 100_000
         assert np.isfinite(points).all()
     assert pair.kind == kind
-    for T in pair.poses:
+    for T in pair.poses[:: max(len(pair.poses) // 20, 1)]:
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
         assert pair.is_right(T)
