@@ -15,6 +15,8 @@ from fmr_cli.synthetic.scenes import BALL, CUBE, Scene
 from fmr_cli.synthetic.sensors import DIFFERENT, Scan, overlap
 from fmr_cli.synthetic.structures import Structure
 
+WHOLE = "surface", "terrestrial"  # sensors that see a room all round
+
 
 def room(rng: np.random.Generator) -> Structure:
     """A furnished room; its walls are solid 0, a shell."""
@@ -38,9 +40,11 @@ def room_scan(s: Structure, rng: np.random.Generator, sensor: str, heading: floa
     return look(s, sensor, rng, free_place(s.scene, rng), towards, BIG, log_uniform(rng, 60, 3000), facing=False)
 
 
-def room_scans(first: Structure, second: Structure, rng: np.random.Generator) -> tuple[Scan, Scan]:
+def room_scans(
+    first: Structure, second: Structure, rng: np.random.Generator, by: tuple[str, ...] = SENSORS
+) -> tuple[Scan, Scan]:
     """A scan of each room, from places of their own, by the same kind of sensor, looking much the same way."""
-    sensor, heading = str(rng.choice(SENSORS)), rng.uniform(0, 2 * np.pi)
+    sensor, heading = str(rng.choice(by)), rng.uniform(0, 2 * np.pi)
     scans = room_scan(first, rng, sensor, heading), room_scan(second, rng, sensor, heading + rng.normal(0, 0.2))
     check_points(*scans)
     return scans
@@ -80,9 +84,14 @@ def mirrored(scan: Scan) -> Scan:
 
 
 def mirrored_room(rng: np.random.Generator) -> Draft:
+    """Scans of a whole room, one of them mirrored; what stands in it is not where its mirror image would be."""
     s = room(rng)
-    source, target = room_scans(s, s, rng)
-    return Draft(source, mirrored(target), [], unique=False)
+    scans = room_scans(s, s, rng, WHOLE)
+    source, target = scans[0], mirrored(scans[1])
+    for turn in (Rotation.identity(), Rotation.from_euler("z", np.pi)):  # the walls go onto themselves
+        if min(overlap(turn.apply(source.points), target.points, DIFFERENT * target.size)) > 0.85:
+            raise Redraw
+    return Draft(source, target, [], unique=False)
 
 
 def mirrored_object(rng: np.random.Generator) -> Draft:

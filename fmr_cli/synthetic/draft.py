@@ -16,6 +16,8 @@ from fmr_cli.synthetic.structures import Structure
 
 SENSORS = ("surface", "terrestrial", "lidar", "camera")
 ENOUGH = 12  # cells (1 / CELLS of a scan's size) that a detail covers in both scans, at least
+SPREAD = 0.025  # least share of the common surface's normals along any direction: a bare wall and a floor have none
+LEAST = 40  # cells of the common surface
 SHARED = 0.3  # of the source that an alias has to lay on the target to be worth listing
 
 
@@ -79,18 +81,19 @@ def check_points(*scans: Scan, least: int = 800) -> None:
         raise Redraw
 
 
-def aliases(structure: Structure, source: Scan, target: Scan) -> list[np.ndarray]:
-    """The structure's symmetries that lay enough of the source on the target, the identity first."""
+def lands(structure: Structure, source: Scan, target: Scan) -> np.ndarray:
+    """The share of the source that each of the structure's symmetries lays on the target."""
     size = min(source.size, target.size)
     cells = voxel_downsample(source.points, size / CELLS)
     probes = cells[:: max(len(cells) // 200, 1)]
-    tree = cKDTree(target.points)
-    shares = np.array(
-        [
-            np.isfinite(tree.query(transform_points(S, probes), distance_upper_bound=1.5 * size / CELLS)[0]).mean()
-            for S in structure.symmetries
-        ]
-    )
+    tree, near = cKDTree(target.points), 1.5 * size / CELLS
+    moved = [transform_points(S, probes) for S in structure.symmetries]
+    return np.array([np.isfinite(tree.query(x, distance_upper_bound=near)[0]).mean() for x in moved])
+
+
+def aliases(structure: Structure, source: Scan, target: Scan) -> list[np.ndarray]:
+    """The structure's symmetries that lay enough of the source on the target, the identity first."""
+    shares = lands(structure, source, target)
     kept = [S for S, share in zip(structure.symmetries, shares, strict=True) if share >= min(SHARED, shares[0])]
     return [S @ turn for S in kept for turn in structure.turns]
 
@@ -104,23 +107,46 @@ def on_details(structure: Structure, points: np.ndarray) -> np.ndarray:
 
 
 def check_unique(structure: Structure, source: Scan, target: Scan) -> None:
-    """Raises Redraw unless a detail shows in both scans that no symmetry of the structure lays on anything."""
+    """Raises Redraw unless the scans share details, and these contradict every alias.
+
+    A detail contradicts a motion that takes it, within the other scan's view, to where that has no surface.
+    """
     size = min(source.size, target.size)
-    for one, other, way in ((source, target, 1), (target, source, -1)):
+    details = []
+    for one, other in ((source, target), (target, source)):
         tree = cKDTree(other.points)
         cells = one.points[on_details(structure, one.points)]
         cells = voxel_downsample(cells, size / CELLS) if len(cells) else cells
         common = cells[tree.query(cells)[0] < 1.5 * size / CELLS] if len(cells) else cells
         if len(common) < ENOUGH:
             raise Redraw
-        for S in structure.symmetries:
-            for turn in structure.turns[::20]:  # a body of revolution: every 60 deg
-                T = S @ turn
-                if np.allclose(T, np.eye(4)):
-                    continue
-                gap = tree.query(transform_points(T if way > 0 else np.linalg.inv(T), common))[0]
-                if (gap > DIFFERENT * size).sum() < 0.8 * ENOUGH:
-                    raise Redraw
+        details.append((common[:: max(len(common) // 150, 1)], tree, other))
+    for S, share in zip(structure.symmetries, lands(structure, source, target), strict=True):
+        for turn in structure.turns[::20] if share >= SHARED else ():  # a body of revolution: every 60 deg
+            T, against = S @ turn, 0
+            for (cells, tree, other), way in zip(details, (T, np.linalg.inv(T)), strict=True):
+                moved = transform_points(way, cells)
+                against += int((other.sees(moved) & (tree.query(moved)[0] > DIFFERENT * size)).sum())
+            if against < ENOUGH and not np.allclose(T, np.eye(4)):
+                raise Redraw
+
+
+def common_cells(source: Scan, target: Scan) -> np.ndarray:
+    """The target's surface (K, 3), on a grid, that the source has too."""
+    edge = min(source.size, target.size) / CELLS
+    cells = voxel_downsample(target.points, edge)
+    return cells[np.isfinite(cKDTree(source.points).query(cells, distance_upper_bound=1.5 * edge)[0])]
+
+
+def check_tied(cells: np.ndarray) -> None:
+    """Raises Redraw unless a common surface (K, 3) faces all ways, so that it ties the pose down."""
+    if len(cells) < LEAST:
+        raise Redraw
+    around = cells[cKDTree(cells).query(cells, 8)[1]]
+    around = around - around.mean(1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
+    if np.linalg.eigvalsh(normals.T @ normals / len(normals))[0] < SPREAD:
+        raise Redraw
 
 
 def several(structure: Structure, source: Scan, target: Scan) -> Draft:

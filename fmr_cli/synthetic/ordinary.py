@@ -6,21 +6,28 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.synthetic import scenes, sensors, shapes
 from fmr_cli.synthetic.contradicting import free_place, lump, room, room_scans
-from fmr_cli.synthetic.draft import Draft, Redraw, check_points, check_unique, log_uniform, look, once
+from fmr_cli.synthetic.draft import (
+    Draft,
+    Redraw,
+    check_points,
+    check_tied,
+    check_unique,
+    common_cells,
+    log_uniform,
+    look,
+    once,
+)
 from fmr_cli.synthetic.repeating import BIG, object_scans
 from fmr_cli.synthetic.scenes import BALL, CUBE, CYLINDER
 from fmr_cli.synthetic.sensors import CELLS, Scan, overlap
 from fmr_cli.synthetic.structures import Structure, about, motion
 
 LOW, HALF = (0.1, 0.3), (0.3, 0.6)  # bands of overlap
-SPREAD = 0.04  # least share of the common surface's normals along any direction: a bare wall and a floor have none
-THINGS = 40  # cells of the common surface that are no wall, floor or ceiling, at least
+THINGS = 30  # cells of the common surface of two room scans that are no wall, floor or ceiling, at least
 
 Maker = Callable[[np.random.Generator], Draft]
 
@@ -118,24 +125,6 @@ DEGENERATE: dict[str, Maker] = {
 # Shy: right, but by little.
 
 
-def common_cells(source: Scan, target: Scan) -> np.ndarray:
-    """The target's surface (K, 3), on a grid, that the source has too."""
-    edge = min(source.size, target.size) / CELLS
-    cells = voxel_downsample(target.points, edge)
-    return cells[np.isfinite(cKDTree(source.points).query(cells, distance_upper_bound=1.5 * edge)[0])]
-
-
-def check_tied(cells: np.ndarray) -> None:
-    """Raises Redraw unless a common surface (K, 3) faces all ways, so that it ties the pose down."""
-    if len(cells) < THINGS:
-        raise Redraw
-    around = cells[cKDTree(cells).query(cells, 8)[1]]
-    around = around - around.mean(1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
-    if np.linalg.eigvalsh(normals.T @ normals / len(normals))[0] < SPREAD:
-        raise Redraw
-
-
 def band(make: Callable[[np.random.Generator, float], tuple[Scan, Scan]], low: float, high: float) -> Maker:
     """A maker of pairs with an overlap (the smaller of the two scans' shares) from low to high.
 
@@ -169,7 +158,7 @@ def room_views(low: float, high: float) -> Maker:
             scans = []
             for place, angle in zip(places, (heading, heading + side * 2.6 * apart), strict=True):
                 towards = [np.cos(angle), np.sin(angle), -0.3]
-                scans.append(sensors.camera_scan(s.scene, rng, place, towards, 6.0, views, 80))
+                scans.append(sensors.camera_scan(s.scene, rng, place, towards, 6.0, views, 64))
             check_points(*scans)
             return scans[0], scans[1]
 
@@ -187,12 +176,12 @@ def street_views(low: float, high: float) -> Maker:
     """LiDAR scans of a street, 5 to 45 m apart."""
 
     def maker(rng: np.random.Generator) -> Draft:
-        scene, reach = scenes.street(rng, 160.0), rng.uniform(25, 45)
-        beams, columns = int(rng.choice([32, 64])), int(rng.integers(360, 700))
-        first = np.array([rng.uniform(-35, -15), rng.uniform(-1.5, 1.5), 1.9])
+        scene, reach = scenes.street(rng, 120.0), rng.uniform(25, 45)
+        beams, columns = int(rng.choice([32, 48])), int(rng.integers(300, 500))
+        first = np.array([rng.uniform(-30, -15), rng.uniform(-1.5, 1.5), 1.9])
 
         def make(rng: np.random.Generator, apart: float) -> tuple[Scan, Scan]:
-            second = first + [5 + 40 * apart, rng.uniform(-1, 1), 0]
+            second = first + np.array([5 + 40 * apart, rng.uniform(-1, 1), 0])
             scans = [sensors.lidar_scan(scene, rng, at, reach, beams, columns) for at in (first, second)]
             check_points(*scans)
             return scans[0], scans[1]

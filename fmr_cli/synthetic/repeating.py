@@ -13,6 +13,8 @@ from fmr_cli.synthetic.draft import (
     Draft,
     Redraw,
     check_points,
+    check_tied,
+    common_cells,
     log_uniform,
     look,
     several,
@@ -87,7 +89,7 @@ def stairs(landing: bool) -> Callable[[np.random.Generator], Draft]:
             end = last + 4.0 if landing else begin + count
             low, high = tread * (begin + rng.uniform(0, 1)), tread * (end - rng.uniform(0, 0.9))
             middle = np.array([0.45, (low + high) / 2, rise * (low + high) / 2 / tread])
-            stand = middle + [0, -rng.uniform(0.5, 1.5), rng.uniform(1.8, 2.6)]
+            stand = middle + np.array([0, -rng.uniform(0.5, 1.5), rng.uniform(1.8, 2.6)])
             scan = look(s, sensor, rng, stand, np.array([0, 1, -0.3]), BIG, log_uniform(rng, 300, 3000))
             scans.append(scan.within([-0.2, low, -BIG], [BIG, high, BIG]))
         check_points(*scans)
@@ -128,7 +130,7 @@ def grid(kind: str, things: bool) -> Callable[[np.random.Generator], Draft]:
             if any(sensors.inside(A, k, stand[None], 0.2)[0] for k, A in zip(s.scene.kinds, s.scene.maps, strict=True)):
                 raise Redraw
             scan = look(s, sensor, rng, stand, np.array([1, 0, 0]), BIG, log_uniform(rng, 60, 3000), facing=False)
-            scans.append(scan.within([*corner, -0.01 if kind == "columns" else -BIG], [*(corner + length), 8]))
+            scans.append(scan.within([*corner, -0.01 if kind == "columns" else -4], [*(corner + length), 8]))
         check_points(*scans)
         pair = swapped(scans, rng)
         return unique(s, *pair) if things else several(s, *pair)
@@ -174,10 +176,16 @@ def pipe(branches: bool) -> Callable[[np.random.Generator], Draft]:
     return make
 
 
-def object_scans(s: Structure, rng: np.random.Generator) -> tuple[Scan, Scan]:
-    """Two scans of an object all round: evenly sampled, or fused from depth views."""
+def object_scans(s: Structure, rng: np.random.Generator, sides: bool = False) -> tuple[Scan, Scan]:
+    """Two scans of an object all round: evenly sampled, or fused from depth views; ``sides``: of one side only."""
     even = rng.random() < 0.5
     scans = []
+    if sides:
+        towards, views = sensors.all_round(1, rng), int(rng.integers(1, 4))
+        for _ in range(2):
+            scans.append(sensors.object_scan(s.scene, rng, towards + rng.normal(0, 0.35, (views, 3)), 90))
+        check_points(*scans, least=400)
+        return scans[0], scans[1]
     for _ in range(2):
         if even:
             scans.append(sensors.surface_scan(s.scene, rng, log_uniform(rng, 700, 12_000), shells=s.shells))
@@ -192,8 +200,11 @@ def part(kind: str, detail: bool) -> Callable[[np.random.Generator], Draft]:
     """A maker of pairs of a gear, flange, table, box or bottle."""
 
     def make(rng: np.random.Generator) -> Draft:
-        s = getattr(structures, kind)(rng, detail)
-        return (unique if detail else several)(s, *object_scans(s, rng))
+        s, sides = getattr(structures, kind)(rng, detail), rng.random() < 0.25
+        pair = object_scans(s, rng, sides)
+        if detail and sides:
+            check_tied(common_cells(*pair))
+        return (unique if detail else several)(s, *pair)
 
     return make
 

@@ -25,16 +25,24 @@ UNIT_AREA = {CUBE: 24.0, BALL: 4 * np.pi, 2: 6 * np.pi}
 @dataclass
 class Scan:
     """points (N, 3) of surfaces, scene frame; origin (3,) of the sensor, None for several or none; stray (K, 3):
-    points that are no surface of the scene (no-returns, sky, people, the sensor's own vehicle)."""
+    points that are no surface of the scene (no-returns, sky, people, the sensor's own vehicle). view (2, 3): corners of
+    the box that the scan was cut to; None where all there was to see was kept."""
 
     points: np.ndarray
     origin: np.ndarray | None = None
     stray: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    view: np.ndarray | None = None
 
     def within(self, low: ArrayLike, high: ArrayLike) -> Scan:
         """The part inside a box: a scan ends where its view was cut, and its border says nothing of the scene."""
-        inside = ((self.points >= np.asarray(low)) & (self.points <= np.asarray(high))).all(1)
-        return replace(self, points=self.points[inside])
+        cut = replace(self, view=np.array([low, high], float))
+        return replace(cut, points=self.points[cut.sees(self.points)])
+
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        """Which of the points (N, 3) lie in its view."""
+        if self.view is None:
+            return np.ones(len(points), bool)
+        return ((points >= self.view[0]) & (points <= self.view[1])).all(1)
 
     def thinned(self, count: int, rng: np.random.Generator) -> Scan:
         """At most ``count`` of the points."""
@@ -114,7 +122,7 @@ def surface_scan(
     """
     solids = list(zip(scene.kinds, scene.maps, strict=True))
     maps = np.array(scene.maps)
-    centres, radii = maps[:, :3, 3], np.sqrt((maps[:, :3, :3] ** 2).sum((1, 2)))
+    centres, halves = maps[:, :3, 3], np.abs(maps[:, :3, :3]).sum(2)  # of boxes about the solids
     area = [UNIT_AREA[kind] * _stretch(kind, A) for kind, A in solids]
     density = min(density, 1.5 * MOST_POINTS / sum(area))
     parts = []
@@ -127,7 +135,7 @@ def surface_scan(
         if facing is not None:
             keep &= np.einsum("ni,ni->n", normals, facing - points) * (-1 if i in shells else 1) > 0
         points = points[keep]
-        for j in np.flatnonzero(np.linalg.norm(centres - centres[i], axis=1) < radii + radii[i]):
+        for j in np.flatnonzero((np.abs(centres - centres[i]) < halves + halves[i]).all(1)):
             if j != i and j not in shells and len(points):
                 points = points[~inside(maps[j], scene.kinds[j], points, -1e-6)]
         parts.append(points)

@@ -108,9 +108,11 @@ def stairs(rng: np.random.Generator, first: int, last: int, landing: int | None 
         if rng.random() < 0.5:
             s.box([0.1, y + 0.3, z], [0.1 + rng.uniform(0.2, 0.6), y + rng.uniform(0.6, 0.9), z + 0.9], detail=True)
     if wall:  # along the slope, so that a step's shift maps it onto itself too
-        middle, slope = (first + last) / 2, np.arctan2(rise, tread)
+        half_way, slope = (first + last) / 2, np.arctan2(rise, tread)
         long = ((last - first) / 2 + 5) * np.hypot(tread, rise)
-        s.add(CUBE, [-0.5, middle * tread, (middle + 0.5) * rise], [0.5, long, 1.5], Rotation.from_euler("x", slope))
+        s.add(
+            CUBE, [-0.5, half_way * tread, (half_way + 0.5) * rise], [0.5, long, 1.5], Rotation.from_euler("x", slope)
+        )
     shifts = [motion(shift=[0, k * tread, k * rise]) for k in steps(last - first)]
     # A zigzag line is its own image under a half turn about the middle of a tread. Only who knows which side is the
     # upper one can tell.
@@ -171,7 +173,7 @@ def seats(rng: np.random.Generator, low: float, high: float) -> Structure:
     width, high_seat, back = rng.uniform(0.4, 0.5), rng.uniform(0.38, 0.48), rng.uniform(0.4, 0.6)
     rows = range(int(np.floor(low / py)), int(np.ceil(high / py)))
     for j in rows:
-        s.box([low, j * py, -8 if rise else -1], [high, (rows[-1] + 2) * py if rise else (j + 1) * py, j * rise])
+        s.box([low, j * py, -9], [high, (rows[-1] + 2) * py if rise else (j + 1.01) * py, j * rise])
         for i in range(int(np.floor(low / px)), int(np.ceil(high / px))):
             x, y, z = i * px, j * py + 0.3, j * rise
             s.box([x, y, z + high_seat - 0.1], [x + width, y + 0.45, z + high_seat])
@@ -318,11 +320,12 @@ def box(rng: np.random.Generator, things: bool) -> Structure:
 def bottle(rng: np.random.Generator, handle: bool) -> Structure:
     """A body of revolution; ``handle``: with a handle and a spout."""
     s, z, low = Structure(), 0.0, rng.uniform(0.12, 0.25)
+    radius = low
     for _ in range(rng.integers(2, 5)):
         radius, half = low * rng.uniform(0.35, 1.2), rng.uniform(0.06, 0.25)
         s.add(CYLINDER, [0, 0, z + half], [radius, radius, half])
         z += 2 * half
-    if rng.random() < 0.5:
+    if rng.random() < 0.5:  # a round stopper
         s.add(BALL, [0, 0, z], [0.8 * radius, 0.8 * radius, radius * rng.uniform(0.5, 1.2)])
     if handle:
         s.add(CUBE, [1.25 * low, 0, 0.5 * z], [0.5 * low, 0.12 * low, 0.3 * z], detail=True)

@@ -1,9 +1,10 @@
 """Made-up pairs on which a verdict is easily fooled or too shy, each with all poses that are right.
 
-    pair = make_pair("facade, a door in both", np.random.default_rng((seed, number)))
+    pair = fresh_pair("facade, a door in both", seed, number)
 
-The kinds, by family, are in ``FAMILIES``. A pair is ``unique`` where exactly one pose is right, so that a verdict should
-say ``aligned``; where several fit equally well, or none is right, ``aligned`` is wrong whatever pose comes with it.
+The kinds, by family, are in ``FAMILIES``. A pair is ``unique`` where exactly one pose is right, so that a verdict
+should say ``aligned``; where several fit equally well, or none is right, ``aligned`` is wrong whatever pose comes with
+it.
 """
 
 from __future__ import annotations
@@ -75,6 +76,11 @@ def make_pair(kind: str, rng: np.random.Generator) -> VerdictPair:
         except Redraw:
             continue
     raise RuntimeError(f"{kind}: no draw in {TRIES} kept what the kind promises")
+
+
+def fresh_pair(kind: str, seed: int, number: int) -> VerdictPair:
+    """Pair ``number`` of a kind in the series ``seed``: the same each time, unlike those of any other kind."""
+    return make_pair(kind, np.random.default_rng((seed, number, *kind.encode())))
 
 
 def moved(kind: str, draft: Draft, rng: np.random.Generator) -> VerdictPair:
