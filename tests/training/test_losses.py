@@ -59,6 +59,12 @@ def test_the_training_jacobian_is_the_exact_one_of_its_critical_points(encoder, 
     assert torch.allclose(jacobian(encoder, encode(encoder, clouds)), expected, atol=1e-5)
 
 
+def test_the_chamfer_loss_reaches_encoder_and_decoder(encoder, clouds):
+    decoder = Decoder(64, 128, (32, 32, 32))
+    chamfer(decoder(encode(encoder, clouds[:, :128]).feature), clouds[:, 128:]).mean().backward()
+    assert all(float(p.grad.abs().sum()) > 0 for p in [*encoder.parameters(), *decoder.parameters()])
+
+
 def test_the_pose_loss_is_small_at_the_truth_and_its_gradient_reaches_the_encoder(encoder, clouds):
     still = Augment(rotation=0, shift=0, offset=0, noise=0, overlap=1, density=1)
     turned = Augment(rotation=90, shift=0, offset=0, noise=0, overlap=1, density=1)
