@@ -50,9 +50,9 @@ def test_the_half_that_is_fitted_has_each_look_and_shares_no_pair():
 
 
 def test_the_table_counts_every_pair_and_its_right_ones():
-    confidence, right = np.array([0.05, 0.6, 0.95, 1.0]), np.array([True, False, True, True])
+    confidence, right = np.array([0.05, 0.8, 0.95, 1.0]), np.array([True, False, True, True])
     lines = calibration_table(confidence, right).splitlines()
-    assert [int(line.split()[-2]) for line in lines[1:-1]] == [1, 0, 0, 1, 0, 1, 1]
+    assert [int(line.split()[-2]) for line in lines[1:-1]] == [1, 0, 0, 0, 1, 1, 1]
     assert lines[-1] == "aligned: precision 0.6667, recall of right poses 0.6667"
 
 

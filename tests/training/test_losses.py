@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fmr_cli.feature_metric.decoder import chamfer
+from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.encoder import jacobian as exact_jacobian
 from fmr_cli.synthetic.batches import Augment, draw_pairs
