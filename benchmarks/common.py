@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.cores import usable_cores
+from fmr_cli.evaluation.baselines import Baseline, gicp, global_baselines
 from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import align
 from fmr_cli.synthetic import scenes
 from fmr_cli.synthetic.shapes import shapes
 
-Way = Callable[[np.ndarray, np.ndarray], np.ndarray]  # source (N, 3), target (M, 3) -> T_target_source
-
+# How source and target differ, see make_pair: the paper's, and any rotation, and part overlap.
 PROTOCOLS = ("copy", "so3", "resample", "noise", "density", "overlap90", "overlap80", "overlap70")
 CORES = usable_cores()
 console = Console(width=150, highlight=False)
@@ -88,78 +88,22 @@ def make_pair(protocol: str, points: np.ndarray, rng: np.random.Generator) -> tu
     return source, transform_points(T, target), T
 
 
-def ways(voxel: float, reach: float) -> dict[str, Way]:
+def ways(voxel: float, reach: float) -> dict[str, Baseline]:
     """fmr and the peers that are installed, each end to end; voxel edge and GICP's reach are the peers'."""
-    found: dict[str, Way] = {
+    refine = partial(gicp, voxel=voxel, reach=reach, threads=CORES)
+
+    def refined(start: Baseline, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return refine(source, target, start=start(source, target))
+
+    found: dict[str, Baseline] = {
         "fmr": lambda source, target: align(PointCloud(source), PointCloud(target), Options(), CORES).T_target_source
     }
-    try:
-        import small_gicp
-    except ImportError as error:
-        console.print(f"peers: skipped ({error})")
-        return found
-
-    def refine(source: np.ndarray, target: np.ndarray, T: np.ndarray) -> np.ndarray:
-        return small_gicp.align(
-            target, source, T, registration_type="GICP", downsampling_resolution=voxel,
-            max_correspondence_distance=reach, num_threads=CORES,
-        ).T_target_source  # fmt: skip
-
-    def refined(begin: Way, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return refine(source, target, begin(source, target))
-
-    for name, start in PEERS.items():
-        try:
-            begin = start(voxel)
-        except (ImportError, OSError) as error:
-            console.print(f"{name}: skipped ({error})")
-            continue
-        found[f"{name} + small_gicp"] = partial(refined, begin)
-    found["small_gicp from the identity"] = lambda source, target: refine(source, target, np.eye(4))
+    peers, missing = global_baselines(voxel)
+    for line in missing:
+        console.print(line)
+    found |= {f"{name} + small_gicp": partial(refined, start) for name, start in peers.items()}
+    found["small_gicp from the identity"] = refine
     return found
-
-
-def kiss_matcher(voxel: float) -> Way:
-    import kiss_matcher as km
-
-    def run(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        matcher = km.KISSMatcher(km.KISSMatcherConfig(voxel))
-        found = matcher.estimate(source.astype(np.float32), target.astype(np.float32))
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = found.rotation, np.ravel(found.translation)
-        return T
-
-    return run
-
-
-def fpfh_ransac(voxel: float) -> Way:
-    import open3d as o3d
-
-    reg = o3d.pipelines.registration
-    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
-
-    def describe(points: np.ndarray) -> tuple[Any, Any]:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
-        return cloud, reg.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(5 * voxel, 100))
-
-    def run(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        (s, fs), (t, ft) = describe(source), describe(target)
-        checks = [
-            reg.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-            reg.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
-        ]
-        return np.array(
-            reg.registration_ransac_based_on_feature_matching(
-                s, t, fs, ft, True, 1.5 * voxel, reg.TransformationEstimationPointToPoint(False), 3, checks,
-                reg.RANSACConvergenceCriteria(100_000, 0.999),
-            ).transformation
-        )  # fmt: skip
-
-    return run
-
-
-PEERS = {"KISS-Matcher": kiss_matcher, "FPFH + RANSAC": fpfh_ransac}  # given a voxel edge, they import their library
 
 
 def interleaved(runs: Mapping[str, Callable[[], Any]], repeats: int, warm: bool = False) -> dict[str, list[float]]:

@@ -21,8 +21,8 @@ from fmr_cli.registration.models import load_encoder
 from fmr_cli.synthetic import scenes, shapes
 from fmr_cli.training.scans import crops_of
 
-POINTS, CLOUD_POINTS = 512, 2048
-SEED = 777_777
+POINTS, CLOUD_POINTS = 512, 2048  # of a pair's clouds, and of those that they are drawn from: as in training
+SEED = 777_777  # of the shapes; no recipe has it
 PLAIN = tuple(Setting(f"plain {angle} deg", (angle, angle), 0.8, resample=False) for angle in (60, 80))
 
 

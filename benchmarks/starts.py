@@ -21,8 +21,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from benchmarks.common import PEERS, Way
 from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.evaluation.baselines import global_baselines
 from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import read_cloud
 from fmr_cli.registration.hypotheses import Hypothesis, from_features, from_search
@@ -63,21 +63,18 @@ def from_folder(folder: Path, count: int, seed: int) -> Iterator[Problem]:
         yield turned(*pairs[i], rng)
 
 
-def peer(start: Callable[[float], Way], pair: Pair) -> list[Hypothesis]:
+def from_peer(name: str, pair: Pair) -> list[Hypothesis]:
     """Where another tool would start, told the pair's voxel edge."""
-    T = start(pair.edge)(pair.source.points, pair.target.points)
+    T = global_baselines(pair.edge)[0][name](pair.source.points, pair.target.points)
     return [Hypothesis(T, "features", pair.overlap_score(T))]
 
 
 def starts() -> dict[str, Callable[[Pair], list[Hypothesis]]]:
-    made: dict[str, Callable[[Pair], list[Hypothesis]]] = {"search": from_search, "features": from_features}
-    for name, start in PEERS.items():
-        try:
-            start(1.0)
-            made[name] = partial(peer, start)
-        except (ImportError, OSError) as error:
-            print(f"{name}: skipped ({error})")
-    return made
+    """Every way to start that can run here; says which cannot."""
+    there, missing = global_baselines(1.0)
+    for line in missing:
+        print(line)
+    return {"search": from_search, "features": from_features, **{name: partial(from_peer, name) for name in there}}
 
 
 def main() -> None:

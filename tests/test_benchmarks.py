@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import paper, speed
+from benchmarks import paper, speed, starts
 from benchmarks.common import PROTOCOLS, interleaved, make_pair, room_clouds
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.geometry.pose_error import pose_error
@@ -95,3 +95,28 @@ def test_the_card_of_the_encoder_can_be_measured_again() -> None:
     said = run("benchmarks.encoders", "models/base.safetensors", "--pairs", "1")
     for clouds in ("shapes", "others", "rooms"):
         assert clouds in said
+
+
+def test_calibrate_prints_weights_and_keeps_the_evidence(tmp_path: Path) -> None:
+    said = run("benchmarks.calibrate", "--pairs", "6", "--workers", "1", "--out", str(tmp_path))
+    assert "poses of 6 pairs" in said
+    assert said.count("confidence   pairs  right") == 1
+    weights = json.loads(said.split("WEIGHTS, fitted on all:")[1].splitlines()[0])
+    with np.load(tmp_path / "evidence.npz") as evidence:
+        assert evidence["x"].shape == (len(evidence["y"]), len(weights))
+
+
+def test_the_pairs_of_starts_are_turned_with_their_truth(room_scans: tuple) -> None:
+    source, target, T = starts.turned(*room_scans, np.eye(4), np.random.default_rng(0))
+    np.testing.assert_allclose(transform_points(T, source), room_scans[0], atol=1e-9)
+    assert target is room_scans[1]
+
+
+def test_starts_are_counted_on_a_folder(tmp_path: Path, room_scans: tuple) -> None:
+    for name, scan in zip("ab", room_scans, strict=True):
+        write_cloud(tmp_path / f"{name}.ply", PointCloud(scan))
+        np.savetxt(tmp_path / f"{name}.pose.txt", np.eye(4))
+    said = run("benchmarks.starts", "--data", str(tmp_path))
+    rows = {line.split()[0]: line.split()[1:4] for line in said.splitlines()}
+    assert rows["features"] == ["1", "1.000", "1.000"]
+    assert "search" in rows

@@ -51,6 +51,7 @@ def train_command(
 ) -> None:
     """Learn an encoder from SCANS, starting from the bundled one; see what it gained.
 
+    A recipe of kind "local" trains the encoder of local patches, on made-up scans alone.
     The folder of the run gets model.safetensors (the best epoch's weights, for `fmr align --model`), README.md (what
     they were made from, held-out figures), recipe.toml, metrics.csv and state.safetensors (for --resume).
     """
@@ -74,8 +75,8 @@ def train_command(
         )
         quiet = quiet or trainer.rank > 0  # of several processes, one speaks
         warn(*warnings, quiet=quiet)
-        say(f"learning from {'; '.join(trainer.data.described)}", quiet=quiet)
-        bar.update(task, description="registering", total=None, said="the held-out clouds, before training")
+        say(f"learning from {'; '.join(trainer.task.described)}", quiet=quiet)
+        bar.update(task, description="testing", total=None, said="what is held out, before training")
         stopped = learn(trainer, partial(bar.update, task), quiet)
     if not quiet:
         conclude(trainer, stopped)
@@ -86,7 +87,7 @@ def learn(trainer: Trainer, show: Callable[..., None], quiet: bool) -> bool:
     from fmr_cli.report.training import epoch_line, line, tensorboard
     from fmr_cli.training.run import write_card
 
-    board = tensorboard(trainer.out) if trainer.rank == 0 else None
+    board = tensorboard(trainer.folder.path) if trainer.rank == 0 else None
     try:
         for report in trainer.run():
             show(description="training", completed=report.step, total=report.steps, said=line(report))

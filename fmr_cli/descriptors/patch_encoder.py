@@ -2,7 +2,7 @@
 
 A patch is the neighbourhood of a keypoint, turned into its own frame (a local reference frame after TOLDI, Yang et al.
 2017) and encoded by a small PointNet of the encoder's kind: a shared MLP, a max over points, two layers. All lengths
-are in voxel edges, so that nothing depends on a unit. Trained by ``fmr_cli.training.local``.
+are in voxel edges, so that nothing depends on a unit. Trained by ``training.local_task``.
 """
 
 from __future__ import annotations

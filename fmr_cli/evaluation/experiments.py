@@ -22,9 +22,10 @@ from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.io import read_cloud
 from fmr_cli.io.folders import find_scans
 
-GRID = 100  # voxel edges in a cloud's size: evens out the density
+GRID = 100  # voxel edges in a cloud's size: evens out the density, and is finer than the spacing of 1,024 points
 SHIFT = 0.8  # of the unit box, the paper's; centring takes it out
-SHOWN = (1, 5, 10)  # iterations of the feature maps
+SHOWN = (1, 5, 10)  # iterations of the feature maps, as in the paper's Figure 7: the first, half-way, the last
+LEAST_POINTS = 100  # of a scan: fewer say nothing about a surface
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,8 @@ def read_clouds(path: Path, count: int | None, points: int, device: torch.device
             skipped.append(str(error))
             continue
         extent = float(np.ptp(cloud, axis=0).max())
-        if len(cloud) < 100 or not extent > 0:
-            skipped.append(f"{file}: too small, {len(cloud)} points where 100 are needed")
+        if len(cloud) < LEAST_POINTS or not extent > 0:
+            skipped.append(f"{file}: too small, {len(cloud)} points where {LEAST_POINTS} are needed")
             continue
         thin = voxel_downsample(cloud, extent / GRID)
         found.append(to_size(thin if len(thin) >= 2 * points else cloud, 2 * points, rng))

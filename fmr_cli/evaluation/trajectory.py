@@ -1,18 +1,23 @@
-"""How far a trajectory is from the truth: KITTI's segment errors, absolute and relative errors, by evo; and a plot."""
+"""How far a trajectory is from the truth: KITTI's segment errors; absolute and relative errors, by evo; and a plot."""
 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fmr_cli.errors import FmrError
+from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import read_poses
 from fmr_cli.io.files import atomic_write
 
-KITTI_LENGTHS = tuple(range(100, 801, 100))  # m
+KITTI_LENGTHS = tuple(range(100, 801, 100))  # m, of the segments; from KITTI's odometry devkit, as is the next
+KITTI_STEP = 10  # frames between the starts of segments: one second
+TENTHS = tuple(range(1, 9))  # of a path shorter than KITTI's segments: its own segments' lengths
 
 
 def read_truth(path: Path, chosen: range, total: int) -> np.ndarray:
@@ -31,14 +36,46 @@ def read_truth(path: Path, chosen: range, total: int) -> np.ndarray:
     return poses
 
 
-def evaluate(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Errors of poses (n, 4, 4) after both first frames are made to coincide; lengths in the poses' unit.
+@dataclass(frozen=True)
+class Segments:
+    """Errors of n segments of a path, each from its own start. length (n,): in the poses' unit, as it was asked for.
 
-    segments: mean translation error (%) and rotation error (deg per 100 units) over all segments of KITTI's lengths
-    100 to 800, or of a tenth to eight tenths of a path that is shorter than 100.
+    translation (n,): how far off the segment's end is, over its length. rotation (n,): degrees over its length.
     """
-    from evo.core.filters import FilterException
-    from evo.core.metrics import APE, RPE, PoseRelation, Unit
+
+    length: np.ndarray
+    translation: np.ndarray
+    rotation: np.ndarray
+
+    def means(self) -> tuple[float, float]:
+        """Over all segments: translation in percent, rotation in degrees per 100 units."""
+        return float(self.translation.mean() * 100), float(self.rotation.mean() * 100)
+
+
+def segment_errors(poses: np.ndarray, truth: np.ndarray, lengths: Sequence[float], step: int) -> Segments:
+    """Errors of poses (n, 4, 4) against the truth (n, 4, 4) over segments, as KITTI's odometry devkit defines them.
+
+    Every ``step``-th frame starts a segment of each length, which ends at the first frame that is further than that
+    along the true path; there is none where the path ends before.
+    """
+    along = np.concatenate([[0.0], np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).cumsum()])
+    starts, asked = (x.ravel() for x in np.meshgrid(np.arange(0, len(truth), step), lengths, indexing="ij"))
+    ends = np.searchsorted(along, along[starts] + asked, side="right")
+    starts, ends, asked = (x[ends < len(truth)] for x in (starts, ends, asked))
+    found, true = (np.linalg.inv(path[starts]) @ path[ends] for path in (poses, truth))
+    degrees, shift = pose_error(found, true)
+    return Segments(asked.astype(float), shift / asked, degrees / asked)
+
+
+def evaluate(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    """Errors of poses (n, 4, 4); lengths in the poses' unit.
+
+    kitti: whether the segments are KITTI's, of 100 to 800, or, of a path shorter than 100, a tenth to eight tenths of
+    it, from every frame. translation_percent, deg_per_100: means over all segments, None where there is none;
+    segments: the means by length. ape_rmse_first_pose: of positions, both first poses made to coincide, so that an
+    error of the first heading counts at every frame; rpe_*: from frame to frame.
+    """
+    from evo.core.metrics import APE, RPE, PoseRelation
     from evo.core.trajectory import PosePath3D
 
     found, true = (PosePath3D(poses_se3=list(np.linalg.inv(path[0]) @ path)) for path in (poses, truth))
@@ -48,30 +85,31 @@ def evaluate(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
         return float(np.sqrt(np.mean(metric.error**2)))
 
     length = float(true.path_length)
-    lengths = [s for s in KITTI_LENGTHS if s < length] if length > KITTI_LENGTHS[0] else np.arange(1, 9) / 10 * length
-    segments = []
-    for segment in lengths:
-        errors = []
-        for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg):
-            metric = RPE(relation, delta=segment, delta_unit=Unit.meters, rel_delta_tol=0.1, all_pairs=True)
-            try:
-                metric.process_data((true, found))
-            except FilterException:  # no two frames are so far apart, to a tenth
-                break
-            errors.append(float(np.mean(metric.error)) * 100 / segment)
-        if len(errors) == 2:
-            segments.append({"length": float(segment), "translation_percent": errors[0], "deg_per_100": errors[1]})
+    kitti = length > KITTI_LENGTHS[0]
+    lengths = KITTI_LENGTHS if kitti else [tenths / 10 * length for tenths in TENTHS]
+    segments = segment_errors(poses, truth, lengths, KITTI_STEP if kitti else 1)
+    means = segments.means() if len(segments.length) else (None, None)
     return {
         "frames": len(poses),
         "length": length,
-        "segments": segments,
-        "translation_percent": float(np.mean([s["translation_percent"] for s in segments])) if segments else None,
-        "deg_per_100": float(np.mean([s["deg_per_100"] for s in segments])) if segments else None,
-        "ate_rmse": rmse(APE(PoseRelation.translation_part)),
+        "kitti": kitti,
+        "segments": [by_length(segments, each) for each in np.unique(segments.length)],
+        "translation_percent": means[0],
+        "deg_per_100": means[1],
+        "ape_rmse_first_pose": rmse(APE(PoseRelation.translation_part)),
         "rpe_translation_rmse": rmse(RPE(PoseRelation.translation_part)),
         "rpe_rotation_deg_rmse": rmse(RPE(PoseRelation.rotation_angle_deg)),
         "end_drift_percent": float(np.linalg.norm(found.positions_xyz[-1] - true.positions_xyz[-1]) / length * 100),
     }
+
+
+def by_length(segments: Segments, length: float) -> dict[str, float]:
+    """The means over the segments of one length."""
+    here = segments.length == length
+    own = Segments(segments.length[here], segments.translation[here], segments.rotation[here])
+    translation, rotation = own.means()
+    return {"length": float(length), "count": int(here.sum()), "translation_percent": translation,
+            "deg_per_100": rotation}  # fmt: skip
 
 
 def summary(errors: dict[str, Any]) -> list[str]:
@@ -80,11 +118,11 @@ def summary(errors: dict[str, Any]) -> list[str]:
     if errors["segments"]:
         first, last = errors["segments"][0]["length"], errors["segments"][-1]["length"]
         lines.append(
-            f"segments of {first:.3g} to {last:.3g}: {errors['translation_percent']:.3f} %, "
-            f"{errors['deg_per_100']:.3f} deg/100"
+            f"{'KITTI ' if errors['kitti'] else ''}segments of {first:.3g} to {last:.3g}: "
+            f"{errors['translation_percent']:.3f} %, {errors['deg_per_100']:.3f} deg/100"
         )
     lines.append(
-        f"ATE {errors['ate_rmse']:.4g}, RPE {errors['rpe_translation_rmse']:.4g} and "
+        f"APE from the first pose {errors['ape_rmse_first_pose']:.4g}, RPE {errors['rpe_translation_rmse']:.4g} and "
         f"{errors['rpe_rotation_deg_rmse']:.4g} deg a frame, end drift {errors['end_drift_percent']:.3f} %"
     )
     return lines

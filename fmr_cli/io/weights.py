@@ -25,20 +25,20 @@ class Weights:
     decoder: dict[str, np.ndarray]
 
 
-def write_weights(path: Path | str, weights: Weights) -> None:
-    """Write encoder and decoder; ``read_weights`` reads them back bit for bit."""
-    from safetensors.numpy import save_file
+def weights_bytes(weights: Weights) -> bytes:
+    """Encoder and decoder as a file; ``read_weights`` reads them back bit for bit."""
+    from safetensors.numpy import save
 
     arrays = {f"decoder.{name}": array for name, array in weights.decoder.items()}
     for i, (W, b) in enumerate(weights.layers):
         arrays |= {f"encoder.layers.{i}.weight": W, f"encoder.layers.{i}.bias": b}
     architecture = {"hidden": list(weights.hidden), "feature_dim": weights.feature_dim}
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    save_file(arrays, str(path), metadata={"architecture": json.dumps(architecture)})
+    return save(arrays, metadata={"architecture": json.dumps(architecture)})
 
 
 def read_weights(path: Path | str) -> Weights:
-    """What ``write_weights`` wrote. Raises ModelError where the file is missing or does not fit."""
+    """What ``weights_bytes`` made. Raises ModelError where the file is missing or does not fit."""
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)

@@ -76,6 +76,11 @@ def bundled_path() -> AbstractContextManager[Path]:
     return as_file(files("fmr_cli.models") / "base.safetensors")
 
 
+def bundled_local_path() -> AbstractContextManager[Path]:
+    """The file of the bundled encoder of local patches, for as long as the context is open."""
+    return as_file(files("fmr_cli.models") / "local.safetensors")
+
+
 def bundled_encoder() -> Encoder:
     """The bundled encoder, as torch has it, on the CPU."""
     return encoder(None, "cpu")
@@ -84,5 +89,5 @@ def bundled_encoder() -> Encoder:
 @lru_cache(maxsize=1)
 def bundled_local_encoder() -> LocalEncoder:
     """The bundled encoder of local patches."""
-    with as_file(files("fmr_cli.models") / "local.safetensors") as path:
+    with bundled_local_path() as path:
         return LocalEncoder.load(path)

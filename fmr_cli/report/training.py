@@ -8,44 +8,45 @@ from typing import Any
 
 from rich.table import Table
 
-from fmr_cli.training.loop import MODEL, Report, Trainer, success_table
+from fmr_cli.training.loop import Report, Trainer
+from fmr_cli.training.run import score_table
+from fmr_cli.training.run_folder import MODEL
 
 
 def line(report: Report) -> str:
+    """What the live line says."""
     minutes, seconds = divmod(int(report.left), 60)
-    return f"loss {report.loss:.4f}, {report.samples_per_second:.0f} clouds/s, {minutes}:{seconds:02} left"
+    return f"loss {report.loss:.4f}, {report.clouds_per_second:.0f} clouds/s, {minutes}:{seconds:02} left"
 
 
 def epoch_line(row: dict[str, Any]) -> str:
+    """What an epoch has to say, from its row of metrics.csv."""
     losses = ", ".join(f"{name[5:]} {value:.5f}" for name, value in row.items() if name.startswith("loss_"))
     errors = [value for name, value in row.items() if name.endswith("median deg")]
-    return (
-        f"epoch {row['epoch']}, step {row['step']}: {losses or 'the start'}; held out: success {row['success']:.3f}, "
-        f"median error {sum(errors) / len(errors):.2f} deg"
-    )
+    median = f", median error {sum(errors) / len(errors):.2f} deg" if errors else ""
+    return f"epoch {row['epoch']}, step {row['step']}: {losses or 'the start'}; held out: {row['success']:.3f}{median}"
 
 
 def table(trainer: Trainer) -> Table:
-    """Held-out success and median error at every setting, at the start and of what is kept."""
-    shown = Table(
-        "held out", "start", "kept", title=f"{trainer.recipe.held_out_pairs} registrations each: below 5 deg (median)"
-    )
-    for name, before, after in success_table(trainer):
-        shown.add_row(name, *(f"{success:.2f} ({median:.2f} deg)" for success, median in (before, after)))
+    """Held-out scores at every setting, at the start and of what is kept."""
+    shown = Table("held out", "start", "kept", title=trainer.task.measured)
+    for row in score_table(trainer):
+        shown.add_row(*row)
     return shown
 
 
 def verdict(trainer: Trainer, stopped: bool) -> str:
     """What was gained, and where it lies."""
-    progress = trainer.progress
+    progress, task = trainer.progress, trainer.task
     how = f"stopped at step {progress.step}: " if stopped else ""
-    where = f"{trainer.out / MODEL}"
+    where = f"{trainer.folder.path / MODEL}"
     if progress.best == 0:
         return f"{how}training made it no better than its start; {where} holds the start"
-    (before, off), (after, now) = trainer.quality(0), trainer.quality(progress.best)
+    before, after = trainer.quality(0)[0], trainer.quality(progress.best)[0]
+    more = task.gain(progress.scores["0"], progress.scores[str(progress.best)])
     return (
-        f"{how}held-out success {before:.3f} at the start, {after:.3f} at epoch {progress.best}, which is kept "
-        f"(mean error, at most 30 each: {-off:.2f} deg before, {-now:.2f} now): {where}"
+        f"{how}{task.measure} {before:.3f} at the start, {after:.3f} at epoch {progress.best}, which is kept"
+        f"{f' ({more})' if more else ''}: {where}"
     )
 
 

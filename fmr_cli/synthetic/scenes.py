@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-CUBE, BALL, CYLINDER = 0, 1, 2
-FAR = 1e9
+CUBE, BALL, CYLINDER = 0, 1, 2  # kinds of solids
+FAR = 1e9  # m: a ray that hits nothing
 
 
 @dataclass

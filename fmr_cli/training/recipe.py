@@ -1,4 +1,8 @@
-"""Every setting of a training run, as a TOML file that can be read back and run again."""
+"""Every setting of a training run, as a TOML file that can be read back and run again.
+
+``kind`` says what is trained: "global", the encoder of whole clouds (Recipe), or "local", that of local patches
+(LocalRecipe).
+"""
 
 from __future__ import annotations
 
@@ -17,9 +21,58 @@ class RecipeError(FmrError):
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """What is trained, on what, and how. Angles in degrees, lengths in units of the normalised cloud."""
+class LocalRecipe:
+    """How the encoder of local patches is trained, on made-up scans alone. Lengths in voxel edges."""
 
+    kind: str = "local"
+    start: str = "base"  # "base", "scratch" or a .safetensors file
+    pairs: int = 480  # of scans, made once and drawn from in every step
+    patches: int = 128  # at most, of each scan of a pair
+    batch: int = 4  # pairs of a step
+    temperature: float = 0.07  # of InfoNCE, as in most work that uses it
+    apart: float = 3.0  # voxel edges: nearer places are not each other's negatives
+    learning_rate: float = 1e-3
+    steps: int = 2400
+    epoch_steps: int = 200
+    seed: int = 0
+    held_out: float = 0.05  # share of the pairs that are never trained on
+
+    def __post_init__(self) -> None:
+        wrong = [
+            f"{name} = {value}" for name, value in asdict(self).items() if isinstance(value, int | float) and value < 0
+        ]
+        for name in ("pairs", "patches", "batch", "temperature", "steps", "epoch_steps"):
+            if not getattr(self, name) >= (1 if name != "temperature" else 1e-6):
+                wrong.append(f"{name} = {getattr(self, name)}")
+        if wrong:
+            raise RecipeError(f"the recipe has {wrong[0]}; give a larger number")
+        if not 0 < self.held_out < 1:
+            raise RecipeError("the recipe needs held_out between 0 and 1")
+        if self.pairs - self.held_out_pairs < self.batch:
+            raise RecipeError(f"the recipe has {self.pairs} pairs; a batch of {self.batch} needs more")
+
+    @property
+    def held_out_pairs(self) -> int:
+        return max(round(self.held_out * self.pairs), 1)
+
+    def changed(self, **changes: Any) -> LocalRecipe:
+        """A copy with other values; None leaves them. Raises RecipeError for what only the global encoder has."""
+        given = {name: value for name, value in changes.items() if value is not None}
+        for name in given:
+            if name not in {f.name for f in fields(self)}:
+                raise RecipeError(f'a recipe of kind "local" has no {name}; leave it away')
+        return replace(self, **given)
+
+    def toml(self) -> str:
+        """The recipe as TOML, every key of it."""
+        return "\n".join([*(f"{name} = {_value(value)}" for name, value in asdict(self).items()), ""])
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the encoder of whole clouds is trained. Angles in degrees, lengths in units of the normalised cloud."""
+
+    kind: str = "global"
     start: str = "base"  # "base", "scratch" or a .safetensors file
     feature_dim: int = 1024  # from scratch only; otherwise the start's
     hidden: tuple[int, ...] = (64, 64, 64, 128)
@@ -95,7 +148,7 @@ def _value(value: Any) -> str:
     return json.dumps(list(value) if isinstance(value, tuple) else value)
 
 
-def read_recipe(path: Path | str) -> Recipe:
+def read_recipe(path: Path | str) -> Recipe | LocalRecipe:
     """Reads a TOML recipe; keys that it lacks keep their defaults. Raises RecipeError for what cannot be run."""
     path = Path(path)
     try:
@@ -105,13 +158,22 @@ def read_recipe(path: Path | str) -> Recipe:
         raise RecipeError(f"{path}: no such recipe; give a .toml file") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise RecipeError(f"{path}: not valid TOML ({error}); see models/base.toml for an example") from None
-    augment = table.pop("augment", {})
-    if not isinstance(augment, dict):
-        raise RecipeError(f"{path}: augment must be a table, [augment]")
     try:
-        return Recipe(**_checked(Recipe, table), augment=Augment(**_checked(Augment, augment)))
+        return _recipe(table)
     except RecipeError as error:
         raise RecipeError(f"{path}: {error}") from None
+
+
+def _recipe(table: dict[str, Any]) -> Recipe | LocalRecipe:
+    kind = table.get("kind", "global")
+    if kind not in ("global", "local"):
+        raise RecipeError(f"kind must be 'global' or 'local', not {kind!r}")
+    if kind == "local":
+        return LocalRecipe(**_checked(LocalRecipe, table))
+    augment = table.pop("augment", {})
+    if not isinstance(augment, dict):
+        raise RecipeError("augment must be a table, [augment]")
+    return Recipe(**_checked(Recipe, table), augment=Augment(**_checked(Augment, augment)))
 
 
 def _checked(cls: type, table: dict[str, Any]) -> dict[str, Any]:

@@ -16,12 +16,12 @@ from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.io import read_cloud, read_transform
 from fmr_cli.synthetic import scenes
 
-CROPS_OF_A_SCAN = 24
-SMALLEST = 256  # points of a crop on its grid
+CROPS_OF_A_SCAN = 24  # at most: balls of a quarter to all of a scan's radius then cover it several times
+SMALLEST = 256  # points of a crop on its grid: half of what a step sees of a cloud
 RADII = (0.25, 1.0)  # of a crop, as shares of the distance that 90 % of the scan's points lie within
 GRID = 30  # voxel edges in a crop's radius: evens out a LiDAR's rings, keeps some thousand points
-SCENE_CROPS = 12
-TRIES = 3  # crops drawn for each that is wanted
+SCENE_CROPS = 12  # of a made-up scan: half as many as of a user's, as there is no lack of such scans
+TRIES = 3  # crops drawn for each that is wanted: balls about points at a scan's border hold too little
 
 
 @dataclass

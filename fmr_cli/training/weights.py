@@ -8,14 +8,14 @@ import torch
 from torch import Tensor, nn
 
 from fmr_cli.feature_metric.encoder import Encoder
-from fmr_cli.io.weights import Weights, read_weights, write_weights
+from fmr_cli.io.weights import Weights, read_weights, weights_bytes
 
 
-def save_encoder(path: Path | str, encoder: Encoder, decoder: nn.Module | None = None) -> None:
-    """Write the weights; a decoder's go along where one is given."""
+def encoder_bytes(encoder: Encoder, decoder: nn.Module | None = None) -> bytes:
+    """The weights as a file; a decoder's go along where one is given."""
     tensors = {} if decoder is None else decoder.state_dict()
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
-    write_weights(path, Weights(encoder.hidden, encoder.feature_dim, encoder.arrays(), arrays))
+    return weights_bytes(Weights(encoder.hidden, encoder.feature_dim, encoder.arrays(), arrays))
 
 
 def load_weights(path: Path | str) -> tuple[Encoder, dict[str, Tensor]]:

@@ -172,7 +172,7 @@ def test_errors_against_the_truth_and_a_plot(fmr_here, street, tmp_path):
     assert done.returncode == 0, done.stderr
     errors = json.loads((tmp_path / "p.evaluation.json").read_text())
     assert errors["frames"] == FRAMES // 2
-    assert errors["ate_rmse"] < 0.03
+    assert errors["ape_rmse_first_pose"] < 0.03
     assert "end drift" in done.stderr
     assert (tmp_path / "p.png").stat().st_size > 1000
 

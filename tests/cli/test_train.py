@@ -74,6 +74,25 @@ def test_the_recipe_of_a_run_gives_the_same_weights_again(tmp_path, fmr_here, sa
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
+def test_a_local_recipe_trains_the_encoder_of_patches(tmp_path, fmr_here, samples):
+    (tmp_path / "local.toml").write_text('kind = "local"\npairs = 5\npatches = 24\nbatch = 2\nepoch_steps = 2\n')
+    done = fmr_here("train", "--recipe", "local.toml", "--epochs", "1", "-o", "run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "pairs of procedural scans" in (tmp_path / "run/README.md").read_text()
+    assert "the nearest descriptor is of the same place" in done.stderr
+    weights = load_file(tmp_path / "run/model.safetensors")
+    assert weights["head.1.weight"].shape == (32, 128)
+    for arguments, said in (
+        ((samples,), "leave SCANS and --pairs away"),
+        (("--unsupervised",), "has a loss of its own"),
+        (("--rotation", "3"), "has no rotation"),
+    ):
+        refused = fmr_here("train", "--recipe", "local.toml", "-o", "other", *arguments, cwd=tmp_path)
+        assert refused.returncode == 2
+        assert said in refused.stderr
+        assert len(refused.stderr.splitlines()) == 1
+
+
 def test_kill_and_resume_end_in_the_same_weights(tmp_path, fmr_here, samples, recipe):
     arguments = ["train", str(samples), "--recipe", str(recipe), "--unsupervised", "--epochs", "4"]
     command = [sys.executable, "-m", "fmr_cli.cli", *arguments, "-o", "killed"]

@@ -1,4 +1,4 @@
-"""Evaluation: errors are what they are called, a setting makes the pairs it says, baselines find small motions."""
+"""The paper's experiments: errors are what they are called, a setting makes the pairs it says, methods see the same."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from fmr_cli.evaluation.experiments import EXPERIMENTS, Clouds, feature_maps, run
 from fmr_cli.evaluation.heldout import Setting, draw, errors
-from fmr_cli.evaluation.methods import baselines, gicp, lm_icp, one_by_one, ours
+from fmr_cli.evaluation.methods import baselines, ours
 from fmr_cli.geometry import se3
 from fmr_cli.registration.models import bundled_encoder
 from fmr_cli.synthetic.shapes import others
@@ -45,17 +45,10 @@ def test_a_setting_makes_the_pairs_it_says(clouds):
     assert sparse.target.shape[1] == 256
 
 
-@pytest.mark.parametrize("baseline", [lm_icp, gicp])
-def test_baselines_find_a_small_motion(clouds, baseline):
-    pairs = draw(clouds.points, Setting("", (5, 5), resample=False), 4, 512, seed=0)
-    found = errors(one_by_one(baseline)(pairs), pairs.truth)
-    assert np.median(found.rotation) < 1
-
-
 def test_the_baselines_have_a_pointnetlk_with_weights_of_its_own(clouds):
     methods, missing = baselines("cpu", 10)
     assert "LM-ICP" in methods
-    assert all("is not installed" in line for line in missing)
+    assert len(methods) + len(missing) == 5
     pairs = draw(clouds.points, Setting("", (20, 20), resample=False), 12, 512, seed=0)
     assert errors(methods["PointNetLK"](pairs), pairs.truth).success > 0.8
 

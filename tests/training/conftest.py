@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fmr_cli.synthetic.shapes import shapes
-from fmr_cli.training.loop import Data
+from fmr_cli.training.global_task import Data
 from fmr_cli.training.recipe import Recipe
 
 

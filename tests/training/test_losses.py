@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fmr_cli.feature_metric.decoder import chamfer
+from fmr_cli.feature_metric.decoder import Decoder, chamfer
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.encoder import jacobian as exact_jacobian
 from fmr_cli.synthetic.batches import Augment, draw_pairs
@@ -57,6 +57,12 @@ def test_the_training_feature_is_the_encoders(encoder, clouds):
 def test_the_training_jacobian_is_the_exact_one_of_its_critical_points(encoder, clouds):
     expected = exact_jacobian(encoder, clouds, critical_index(encoder, clouds))
     assert torch.allclose(jacobian(encoder, encode(encoder, clouds)), expected, atol=1e-5)
+
+
+def test_the_chamfer_loss_reaches_encoder_and_decoder(encoder, clouds):
+    decoder = Decoder(64, 128, (32, 32, 32))
+    chamfer(decoder(encode(encoder, clouds[:, :128]).feature), clouds[:, 128:]).mean().backward()
+    assert all(float(p.grad.abs().sum()) > 0 for p in [*encoder.parameters(), *decoder.parameters()])
 
 
 def test_the_pose_loss_is_small_at_the_truth_and_its_gradient_reaches_the_encoder(encoder, clouds):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from fmr_cli.training.recipe import Recipe, RecipeError, read_recipe
+from fmr_cli.training.recipe import LocalRecipe, Recipe, RecipeError, read_recipe
 
 
 def test_a_recipe_survives_its_file(tmp_path):
@@ -34,6 +36,10 @@ def test_missing_keys_keep_their_defaults(tmp_path):
         ("anchor_steps = 5\nanchor_width = 0", "anchor_width = 0"),
         ("steps =", "not valid TOML"),
         ("augment = 3", "must be a table"),
+        ("kind = 'other'", "kind must be 'global' or 'local'"),
+        ("kind = 'local'\npoints = 3", "unknown key 'points'"),
+        ("kind = 'local'\npairs = 2", "2 pairs; a batch of 4 needs more"),
+        ("kind = 'local'\ntemperature = 0", "temperature = 0"),
     ],
 )
 def test_what_cannot_be_run_is_said_on_one_line(tmp_path, text, said):
@@ -42,3 +48,17 @@ def test_what_cannot_be_run_is_said_on_one_line(tmp_path, text, said):
         read_recipe(tmp_path / "r.toml")
     assert str(error.value).startswith(str(tmp_path / "r.toml"))
     assert "\n" not in str(error.value)
+
+
+def test_a_local_recipe_survives_its_file_and_has_no_settings_of_the_global_one(tmp_path):
+    recipe = LocalRecipe().changed(steps=7, rotation=None)
+    (tmp_path / "r.toml").write_text(recipe.toml())
+    assert read_recipe(tmp_path / "r.toml") == recipe
+    with pytest.raises(RecipeError, match='"local" has no rotation'):
+        recipe.changed(rotation=10.0)
+
+
+@pytest.mark.parametrize("name", ["base", "local", "pointnetlk"])
+def test_the_bundled_recipes_can_be_read(name):
+    recipe = read_recipe(Path(__file__).parents[2] / f"models/{name}.toml")
+    assert (recipe.kind, recipe.start) == ("local" if name == "local" else "global", "scratch")

@@ -1,0 +1,42 @@
+"""How true the verdict is: how often the poses of each confidence are right, as a table and a plot."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+
+from fmr_cli.io.files import atomic_write
+from fmr_cli.registration.confidence import ALIGNED
+
+BINS = (0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.01)  # edges in confidence; the last bin holds 1
+
+
+def calibration_table(confidence: np.ndarray, right: np.ndarray) -> str:
+    """The share of right poses by confidence, and precision and recall of `aligned`; both (pairs,)."""
+    lines = ["confidence   pairs  right"]
+    for low, high in itertools.pairwise(BINS):
+        here = (confidence >= low) & (confidence < high)
+        share = right[here].mean() if here.any() else np.nan
+        lines.append(f"{low:.2f} to {min(high, 1):.2f}  {here.sum():5d}  {share:.3f}")
+    called = confidence >= ALIGNED
+    precision = right[called].mean() if called.any() else np.nan
+    recall = called[right].mean() if right.any() else np.nan
+    lines.append(f"aligned: precision {precision:.4f}, recall of right poses {recall:.4f}")
+    return "\n".join(lines)
+
+
+def plot_calibration(path: Path, confidence: np.ndarray, right: np.ndarray) -> None:
+    """Confidence against the share that is right, in tenths of the pairs; an image file by the path's suffix."""
+    from matplotlib.figure import Figure
+
+    edges = np.quantile(confidence, np.linspace(0, 1, 11))
+    bins = [(confidence >= a) & (confidence <= b) for a, b in itertools.pairwise(edges)]
+    figure = Figure((5, 5), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="0.7")
+    axes.plot([confidence[b].mean() for b in bins], [right[b].mean() for b in bins], "o-")
+    axes.set(xlabel="confidence", ylabel="share that is right", title=f"{len(confidence)} pairs not fitted")
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=120)

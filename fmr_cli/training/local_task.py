@@ -1,0 +1,154 @@
+"""The encoder of local patches: InfoNCE between two made-up scans' views of one place, no real scan and no label."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from fmr_cli.descriptors.patch_encoder import CHANNELS
+from fmr_cli.errors import ModelError
+from fmr_cli.training.local_views import Views
+from fmr_cli.training.recipe import LocalRecipe
+from fmr_cli.training.run_folder import held
+from fmr_cli.training.task import Scores, Task, ramped_cosine
+
+RANK1 = "rank-1"  # column of metrics.csv
+EXCLUDED = -1e4  # a logit whose exponential is 0 in bfloat16 and float32 alike
+
+
+class LocalNet(nn.Module):
+    """``LocalEncoder`` as it is trained: (K, PATCH_POINTS, CHANNELS) -> (K, 32), unit length."""
+
+    def __init__(self, point: tuple[int, ...] = (64, 128, 128), head: tuple[int, ...] = (128, 32)) -> None:
+        super().__init__()
+        self.point = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((CHANNELS, *point)))
+        self.head = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((point[-1], *head)))
+
+    def forward(self, patches: Tensor) -> Tensor:
+        x = patches
+        for layer in self.point:
+            x = torch.relu(layer(x))
+        x = x.amax(-2)
+        for layer in self.head[:-1]:
+            x = torch.relu(layer(x))
+        return nn.functional.normalize(self.head[-1](x), dim=-1)
+
+
+def read_local_start(name: str) -> dict[str, Tensor] | None:
+    """The weights to start from: "scratch" is None, "base" the bundled ones, else a file. Raises ModelError."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from fmr_cli.registration.models import bundled_local_path
+
+    if name == "scratch":
+        return None
+    try:
+        if name == "base":
+            with bundled_local_path() as path:
+                return load_file(path)
+        return load_file(name)
+    except FileNotFoundError:
+        raise ModelError(f"{name}: no such model file; give a .safetensors file written by `fmr train`") from None
+    except (SafetensorError, OSError) as error:
+        raise ModelError(f"{name}: not a safetensors file ({error}); give one written by `fmr train`") from None
+
+
+def info_nce(a: Tensor, b: Tensor, place: Tensor, temperature: float, apart: float) -> Tensor:
+    """InfoNCE of descriptors a, b (n, d) whose rows correspond; rows of places nearer than ``apart`` do not repel."""
+    logits = a @ b.T / temperature
+    close = (torch.cdist(place, place) < apart) & ~torch.eye(len(a), dtype=torch.bool, device=a.device)
+    logits = logits.masked_fill(close, EXCLUDED)
+    label = torch.arange(len(a), device=a.device)
+    return (nn.functional.cross_entropy(logits, label) + nn.functional.cross_entropy(logits.T, label)) / 2
+
+
+class LocalTask(Task):
+    """Trains ``LocalNet`` on ``material`` by ``recipe``, from the weights ``start`` or, where it is None, from nothing.
+
+    The first pairs of the material are held out.
+    """
+
+    recipe: LocalRecipe
+    measure, measured = "held-out rank-1", "the nearest descriptor is of the same place"
+    clip = math.inf  # descriptors have unit length, which bounds the gradient
+
+    def __init__(
+        self, recipe: LocalRecipe, material: list[Views], device: torch.device, start: dict[str, Tensor] | None
+    ) -> None:
+        self.recipe, self.device, self.clouds = recipe, device, 2 * recipe.batch
+        material = [views.to(device) for views in material]
+        self.held_out, self.material = material[: recipe.held_out_pairs], material[recipe.held_out_pairs :]
+        patches = sum(len(views.place) for views in self.material)
+        self.described = [
+            f"{len(self.material)} pairs of procedural scans with {patches} corresponding patches, "
+            f"{len(self.held_out)} pairs held out"
+        ]
+        torch.manual_seed(recipe.seed)
+        self.net = LocalNet().to(device)
+        if start is not None:
+            try:
+                self.net.load_state_dict(start)
+            except RuntimeError as error:
+                reason = " ".join(str(error).split())[:200]
+                raise ModelError(f"{recipe.start}: the weights do not fit the local encoder ({reason})") from None
+        self.modules: dict[str, nn.Module] = {"local": self.net}
+
+    def losses(self, step: int, steps: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """InfoNCE of a batch of pairs, the products in bfloat16."""
+        order = torch.randperm(len(self.material), generator=generator, device=self.device)
+        chosen = [self.material[int(i)] for i in order[: self.recipe.batch]]
+        with torch.autocast(self.device.type, torch.bfloat16):
+            described = self.net(torch.cat([x for v in chosen for x in (v.source, v.target)])).float()
+        parts = iter(described.split([len(v.place) for v in chosen for _ in range(2)]))
+        temperature, apart = self.recipe.temperature, self.recipe.apart
+        each = [info_nce(next(parts), next(parts), v.place, temperature, apart) for v in chosen]
+        return {"info_nce": torch.stack(each).mean()}
+
+    def rate(self, step: int, steps: int) -> float:
+        return ramped_cosine(step, 0, steps, self.recipe.learning_rate, ramp=1)
+
+    @torch.no_grad()
+    def test(self) -> Scores:
+        """How often the nearest descriptor among the other scan's is of the same place, within ``apart``."""
+        shares = []
+        for views in self.held_out:
+            nearest = (self.net(views.source) @ self.net(views.target).T).argmax(1)
+            off = (views.place[nearest] - views.place).norm(dim=1)
+            shares.append(float((off < self.recipe.apart).float().mean()))
+        return {"same place": {RANK1: float(np.mean(shares))}}
+
+    def quality(self, scores: Scores) -> tuple[float, ...]:
+        return (scores["same place"][RANK1],)
+
+    def may_choose(self, step: int) -> bool:
+        return True
+
+    def weights(self) -> bytes:
+        """The file that ``LocalEncoder.load`` reads."""
+        from safetensors.torch import save
+
+        return save(held(self.net.state_dict()))
+
+    def shown(self, scores: dict[str, float]) -> str:
+        return f"{scores[RANK1]:.3f}"
+
+    def gain(self, before: Scores, after: Scores) -> str:
+        return ""
+
+    def card(self) -> list[str]:
+        recipe = self.recipe
+        return [
+            "The encoder of local patches, in the format of `models/local.safetensors`, whose place it can take.",
+            "",
+            f"- Encoder: {sum(p.numel() for p in self.net.parameters())} parameters, started from {recipe.start}.",
+            f"- Data: {'; '.join(self.described)}.",
+            f"- Loss: InfoNCE at temperature {recipe.temperature:g}, {recipe.batch} pairs a step; places nearer than "
+            f"{recipe.apart:g} voxel edges do not repel each other.",
+            f"- Tested on {len(self.held_out)} held-out pairs: how often the nearest of up to {recipe.patches} "
+            f"descriptors is of the same place, within {recipe.apart:g} voxel edges.",
+        ]

@@ -1,0 +1,101 @@
+"""The local encoder's training: its loss, its file, and a run that learns, is killed and goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from fmr_cli.descriptors.patch_encoder import LocalEncoder
+from fmr_cli.errors import ModelError
+from fmr_cli.registration.models import bundled_local_encoder
+from fmr_cli.training.local_task import LocalNet, LocalTask, info_nce, read_local_start
+from fmr_cli.training.local_views import Views, make_material, pair_views
+from fmr_cli.training.loop import Trainer
+from fmr_cli.training.recipe import LocalRecipe
+
+CPU = torch.device("cpu")
+TINY = LocalRecipe(start="scratch", pairs=4, patches=32, batch=2, steps=6, epoch_steps=2, held_out=0.25)
+
+
+@pytest.fixture(scope="module")
+def material() -> list[Views]:
+    return [pair_views((5, number), 32) for number in range(TINY.pairs)]
+
+
+def finish(trainer: Trainer) -> list[dict]:
+    return [report.row for report in trainer.run() if report.row]
+
+
+def test_info_nce_is_zero_where_each_row_fits_its_own_alone():
+    place = torch.arange(4.0)[:, None] * 10 * torch.ones(3)
+    assert float(info_nce(torch.eye(4), torch.eye(4), place, 0.01, 3)) == pytest.approx(0, abs=1e-6)
+    mixed = torch.eye(4)[[1, 0, 3, 2]]
+    assert float(info_nce(torch.eye(4), mixed, place, 0.1, 3)) > 5
+
+
+def test_near_places_do_not_repel():
+    place = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+    same = torch.ones(2, 1)
+    assert float(info_nce(same, same, place, 0.1, apart=3)) == pytest.approx(0, abs=1e-6)
+    assert float(info_nce(same, same, place, 0.1, apart=0.5)) == pytest.approx(np.log(2))
+
+
+def test_views_are_the_same_for_any_number_of_workers(material):
+    seen = []
+    again = make_material(2, 32, 5, lambda done, total: seen.append((done, total)), workers=1)
+    assert seen == [(1, 2), (2, 2)]
+    assert all(
+        torch.equal(a.source, b.source) and torch.equal(a.place, b.place)
+        for a, b in zip(again, material[:2], strict=True)
+    )
+
+
+def test_the_file_is_what_registration_reads(tmp_path, material):
+    task = LocalTask(TINY, material, CPU, None)
+    (tmp_path / "l.safetensors").write_bytes(task.weights())
+    patches = material[0].source
+    described = LocalEncoder.load(tmp_path / "l.safetensors")(patches.numpy())
+    np.testing.assert_allclose(described, task.net(patches).detach().numpy(), atol=1e-5)
+
+
+def test_training_starts_from_the_bundled_weights_and_is_better_than_nothing(material):
+    bundled = LocalTask(TINY, material, CPU, read_local_start("base"))
+    np.testing.assert_allclose(
+        bundled.net(material[0].source).detach().numpy(), bundled_local_encoder()(material[0].source.numpy()), atol=1e-5
+    )
+    untrained = LocalTask(TINY, material, CPU, None)
+    assert bundled.quality(bundled.test()) > untrained.quality(untrained.test())
+
+
+def test_a_run_learns_and_its_best_is_kept(tmp_path, material):
+    recipe = TINY.changed(steps=60, epoch_steps=30)
+    rows = finish(Trainer(LocalTask(recipe, material, CPU, None), tmp_path))
+    assert rows[-1]["loss_info_nce"] < rows[1]["loss_info_nce"]
+    LocalNet().load_state_dict(load_file(tmp_path / "model.safetensors"))
+
+
+def test_a_run_that_ends_anywhere_goes_on_to_the_same_numbers(tmp_path, material):
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "killed").mkdir()
+    finish(Trainer(LocalTask(TINY, material, CPU, None), tmp_path / "whole"))
+    for report in Trainer(LocalTask(TINY, material, CPU, None), tmp_path / "killed").run():
+        if report.step == 3:
+            break
+    finish(Trainer(LocalTask(TINY, material, CPU, None), tmp_path / "killed", resume=True))
+    whole, killed = (load_file(tmp_path / run / "state.safetensors") for run in ("whole", "killed"))
+    assert all(torch.equal(whole[name], killed[name]) for name in whole)
+
+
+@pytest.mark.parametrize(("name", "said"), [("none.safetensors", "no such model"), ("bad.safetensors", "not a safe")])
+def test_what_is_no_start_is_one_line(tmp_path, name, said):
+    (tmp_path / "bad.safetensors").write_text("no weights")
+    with pytest.raises(ModelError, match=said):
+        read_local_start(str(tmp_path / name))
+
+
+def test_weights_of_another_encoder_are_one_line(material):
+    with pytest.raises(ModelError, match="do not fit the local encoder") as error:
+        LocalTask(TINY.changed(start="x.safetensors"), material, CPU, {"point.0.weight": torch.zeros(3, 3)})
+    assert "\n" not in str(error.value)
