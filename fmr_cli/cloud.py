@@ -69,8 +69,8 @@ class PointCloud:
         """The file's path for messages, or a placeholder for a cloud made in memory."""
         return str(self.path) if self.path else "<cloud in memory>"
 
-    def select(self, index: np.ndarray) -> PointCloud:
-        """The points (and their attributes) at an index array or boolean mask of shape (N,)."""
+    def select(self, index: np.ndarray | slice) -> PointCloud:
+        """The points (and their attributes) at an index array, a boolean mask of shape (N,), or a slice."""
         return replace(
             self, points=self.points[index], attributes={name: v[index] for name, v in self.attributes.items()}
         )

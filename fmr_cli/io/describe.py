@@ -53,8 +53,8 @@ def spacing(stream: CloudStream) -> float | None:
     rng = np.random.default_rng(0)
     distances = []
     for slab in slabs_of(stream):
-        queries = slab[rng.choice(len(slab), min(len(slab), SAMPLE if len(slab) == stream.survey.count else SAMPLE // SLABS),
-                                  replace=False)]  # fmt: skip
+        wanted = SAMPLE if len(slab) == stream.survey.count else SAMPLE // SLABS
+        queries = slab[rng.choice(len(slab), min(len(slab), wanted), replace=False)]
         near = np.sort(cKDTree(slab).query(queries, k=9)[0], axis=1)  # nine, since some may be the same point again
         near[(near == 0) | np.isinf(near)] = np.nan
         distances.append(near[np.arange(len(near)), np.isnan(near).argmin(axis=1)])

@@ -22,8 +22,8 @@ ALIASES = {
 }
 # How programs call the coordinates: as `plain` writes a name
 AXES = {
-    "x": ("x", "xcoord", "xcoordinate", "coordx", "posx", "positionx", "px", "pointx", "points0", "easting", "east", "e",
-          "ostwert", "rechtswert"),
+    "x": ("x", "xcoord", "xcoordinate", "coordx", "posx", "positionx", "px", "pointx", "points0", "easting", "east",
+          "e", "ostwert", "rechtswert"),
     "y": ("y", "ycoord", "ycoordinate", "coordy", "posy", "positiony", "py", "pointy", "points1", "northing", "north",
           "n", "nordwert", "hochwert"),
     "z": ("z", "zcoord", "zcoordinate", "coordz", "posz", "positionz", "pz", "pointz", "points2", "elevation", "elev",

@@ -1,4 +1,4 @@
-"""NPY: (N, 3+) numbers, (3, N) too, or records with x, y, z. NPZ: `points` (N, 3), attributes, `crs`, `sensor_origin`."""
+"""NPY: (N, 3+) numbers, (3, N) too, or records with x, y, z. NPZ: `points` (N, 3), attributes, crs, sensor_origin."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import tempfile
 import zipfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import bare_cloud, bare_names, coordinates, lost_context, native, refuse_degrees, to_cloud
-from fmr_cli.io.stream import CHUNK, CloudStream, Wanted
+from fmr_cli.io.stream import CHUNK, CloudStream, Column, Wanted
 
 DEFLATE_LIMIT = 1100  # zip cannot shrink data more than this many times
 OWN = ("points", "crs", "sensor_origin", "file")  # names an attribute in an NPZ cannot have
@@ -44,7 +45,7 @@ def clouds_of(array: np.ndarray, attributes: bool) -> Iterator[PointCloud]:
         array = array.reshape(-1)
         for start in range(0, max(len(array), 1), CHUNK):
             part = array[start : start + CHUNK]
-            yield to_cloud({name: part[name] for name in part.dtype.names}, attributes)
+            yield to_cloud({name: part[name] for name in array.dtype.names or ()}, attributes)
         return
     rows = as_rows(array)
     names = bare_names(np.asarray(rows[: 1 << 16, 3:]))
@@ -169,18 +170,17 @@ def write_npz(path: Path, stream: CloudStream) -> list[str]:
         names[name] = f"{name}_" if name in OWN else name
         if names[name] != name:
             warnings.append(f"attribute {name!r} is written as {names[name]!r}")
-    waiting = {name: tempfile.TemporaryFile(dir=path.parent) for name in ("points", *names)}
-    try:
+    with ExitStack() as stack:
+        waiting = {n: stack.enter_context(tempfile.TemporaryFile(dir=path.parent)) for n in ("points", *names)}
         for cloud in stream:
             waiting["points"].write(cloud.points.tobytes())
             for name, column in survey.columns.items():
                 waiting[name].write(np.ascontiguousarray(cloud.attributes[name], column.dtype).tobytes())
         with zipfile.ZipFile(path, "w") as archive:
             for name, file in waiting.items():
-                column = survey.columns.get(name)
-                shape = (survey.count, 3) if column is None else (survey.count, *column.shape)
+                own = survey.columns.get(name, Column(np.dtype("<f8"), (3,)))
                 with archive.open(f"{names.get(name, name)}.npy", "w", force_zip64=True) as entry:
-                    write_header(entry, shape, np.dtype("<f8") if column is None else column.dtype)
+                    write_header(entry, (survey.count, *own.shape), own.dtype)
                     file.seek(0)
                     while block := file.read(1 << 24):
                         entry.write(block)
@@ -188,7 +188,4 @@ def write_npz(path: Path, stream: CloudStream) -> list[str]:
                 if value is not None and len(value):
                     with archive.open(f"{name}.npy", "w") as entry:
                         np.lib.format.write_array(entry, np.asarray(value))
-    finally:
-        for file in waiting.values():
-            file.close()
     return warnings

@@ -110,11 +110,10 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
 
 def context_of(header: Header) -> dict[str, Any]:
     """What the header says of the whole cloud."""
-    lists = [
-        f"list property {p.name!r}" for e in header.elements if e.name == "vertex" for p in e.properties if p.count_type
-    ]
+    vertex = next(e for e in header.elements if e.name == "vertex")
+    lists = [f"list property {p.name!r}" for p in vertex.properties if p.count_type]
     others = [f"element {e.name!r}" for e in header.elements if e.name not in ("vertex", "face")]
-    origin = np.array(header.comments.get("sensor_origin", "").split() or [np.nan], dtype=np.float64)
+    origin = np.array(header.comments.get("sensor_origin", "nan").split(), dtype=np.float64)
     return {
         "left_out": (*lists, *others),
         "crs": header.comments.get("crs"),
@@ -301,8 +300,8 @@ def write(path: Path, stream: CloudStream) -> list[str]:
     """Binary little endian, coordinates as double; what PLY cannot hold comes back as warnings."""
     survey = stream.survey
     fields, warnings = fields_of(survey, split=True, eight_bit=True)
-    for field in fields:
-        if rounded := storable(field, survey.columns[field.of], long_integers=False):
+    for column in fields:
+        if rounded := storable(column, survey.columns[column.of], long_integers=False):
             warnings.append(f"PLY holds no 8-byte integers: {rounded}")
     dtype = np.dtype([(axis, "<f8") for axis in "xyz"] + [(f.name, "<" + f.dtype.str[1:]) for f in fields])
     header = ["ply", "format binary_little_endian 1.0", "comment written by fmr"]

@@ -12,15 +12,7 @@ from fmr_cli.cloud import PointCloud
 
 CHUNK = 1 << 18  # points that are in memory at a time; with LAS's attributes and their copies about 100 MB
 COLORS = ("red", "green", "blue")
-UNTYPED = (
-    "xyz",
-    "csv",
-    "pts",
-    "ptx",
-    "npy",
-    "npz",
-    "kitti",
-)  # formats whose numbers have no type, or one for all columns
+UNTYPED = ("xyz", "csv", "pts", "ptx", "npy", "npz", "kitti")  # formats whose columns have no type of their own
 
 
 @dataclass

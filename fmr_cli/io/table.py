@@ -1,4 +1,4 @@
-"""Lines of numbers, as text formats hold them: bounded lines in, arrays out, and a line number where one does not fit."""
+"""Lines of numbers, as text holds them: bounded lines in, arrays out, the number of a line that does not fit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TextIO
+from typing import IO, Any, TextIO
 
 import numpy as np
 
@@ -26,8 +26,11 @@ MISSING = {"", "nan", "+nan", "-nan", "na", "n/a", "#n/a", "null", "none", "-", 
            "1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind", "#num!", "*"}  # fmt: skip
 INFINITE = {"1.#inf": np.inf, "-1.#inf": -np.inf}
 FORTRAN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[dD][+-]?\d+")
-THOUSANDS = re.compile(r"[+-]?\d{1,3}([ '\u00a0\u2019\u202f]\d{3})+([.,]\d*)?|[+-]?\d{1,3}(,\d{3}){2,}|[+-]?\d{1,3}(,\d{3})+\.\d+"
-                       r"|[+-]?\d{1,3}(\.\d{3})+,\d+|[+-]?\d{1,3}(\.\d{3}){2,}")  # fmt: skip
+# 1 234.5, 1'234.5; 1,234,567; 1,234.5; 1.234,5; 1.234.567
+THOUSANDS = re.compile(
+    r"[+-]?\d{1,3}([ '\u00a0\u2019\u202f]\d{3})+([.,]\d*)?|[+-]?\d{1,3}(,\d{3}){2,}"
+    r"|[+-]?\d{1,3}(,\d{3})+\.\d+|[+-]?\d{1,3}(\.\d{3})+,\d+|[+-]?\d{1,3}(\.\d{3}){2,}"
+)
 # Coordinates shrink to a fifth, those of a grid to a twentieth; what shrinks more is no scan.
 GZIP_RATIO, GZIP_LEAST = 25, 10_000_000
 
@@ -38,7 +41,7 @@ def open_text(path: Path) -> Iterator[TextIO]:
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
-        binary: IO[bytes] = BoundedGzip(raw, path.stat().st_size) if packed else raw
+        binary: Any = BoundedGzip(raw, path.stat().st_size) if packed else raw
         head = binary.read(4096)
         binary.seek(0)
         with io.TextIOWrapper(binary, encoding=encoding_of(head), errors="replace") as file:

@@ -103,8 +103,8 @@ def find_table(head: Rows) -> Table:
         refuse_degrees(first)
         if not coordinates(first):
             raise CloudFileError(
-                f"line {head.numbers[0]}: expected numbers, or names of which some are x, y and z (or Easting, Northing, "
-                f"Elevation and the like), found {head.lines[0].strip()[:60]!r}"
+                f"line {head.numbers[0]}: expected numbers, or names of which some are x, y and z "
+                f"(or Easting, Northing, Elevation and the like), found {head.lines[0].strip()[:60]!r}"
             )
         named = first
         del head.lines[0], head.numbers[0]
@@ -166,10 +166,11 @@ def find_dialect(head: Rows) -> Dialect:
             delimiter = ","
             if quoted and any("," in c for c in cells):  # "1,5","2,5": decimals; "1,234.5": marks between thousands
                 comma = not any(THOUSANDS.fullmatch(c.strip()) for c in cells)
-    if comma and delimiter != "," and (bad := next((c for line in lines for c in line.split(delimiter)
-                                                   if THOUSANDS.fullmatch(c.strip(' "\n')) and ("." in c or " " in c.strip())), None)):  # fmt: skip
+    cells = [cell.strip(' "\n') for line in lines for cell in line.split(delimiter)] if comma else []
+    marked = next((c for c in cells if THOUSANDS.fullmatch(c) and re.search(r"[. ]", c)), None)
+    if marked is not None and delimiter != ",":
         raise CloudFileError(
-            f"{bad.strip()!r} has marks between the thousands as well as decimals: export it again without them"
+            f"{marked!r} has marks between the thousands as well as decimals: export it again without them"
         )
     if delimiter == "," and comma:
         raise CloudFileError("has commas both as decimals and between the columns: export it with semicolons or points")
