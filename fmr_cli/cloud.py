@@ -65,6 +65,11 @@ class PointCloud:
         return len(self.points)
 
     @property
+    def count(self) -> int:
+        """How many points the file has, besides those dropped."""
+        return len(self) if self.total is None else self.total
+
+    @property
     def name(self) -> str:
         """The file's path for messages, or a placeholder for a cloud made in memory."""
         return str(self.path) if self.path else "<cloud in memory>"

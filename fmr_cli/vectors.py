@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 # The name without its x, y or z, in small letters without _ - . and blanks -> what a transform does to it
-DIRECTIONS = ("n", "nor", "norm", "normal", "normals", "pointnormal", "vertexnormal", "dir", "direction", "ray",
-              "raydir", "raydirection", "beam", "beamdirection", "scandirection", "viewdirection", "tangent", "axis")  # fmt: skip
+DIRECTIONS = ("n", "nor", "norm", "normal", "normals", "pointnormal", "vertexnormal", "dir", "direction",
+              "ray", "raydir", "raydirection", "beam", "beamdirection", "scandirection", "viewdirection",
+              "tangent", "axis")  # fmt: skip
 # t: the LAS waveform's direction, coordinates per picosecond. d: scan direction or flow; both turn
 DISPLACEMENTS = ("v", "vel", "velocity", "velocities", "speed", "flow", "sceneflow", "motion", "displacement", "d",
                  "offset", "t", "acc", "acceleration")  # fmt: skip

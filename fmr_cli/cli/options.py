@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fmr_cli.errors import FmrError
 from fmr_cli.registration.options import Options, flag, read_init
 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
@@ -18,6 +19,20 @@ Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, help="Say what was decided and why; -vv says more.")
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Where an error comes from, as a traceback.")]
+BinColumns = Annotated[
+    str | None,
+    typer.Option(help="What the float32 of a .bin are, such as x,y,z,intensity,ring; told by the values if not given."),
+]
+
+
+def columns(given: str | None) -> tuple[str, ...] | None:
+    """--bin-columns as names. Raises FmrError where x, y and z are not among them, or a name is there twice."""
+    if given is None:
+        return None
+    names = tuple(name.strip() for name in given.split(","))
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names) or not all(names):
+        raise FmrError(f"--bin-columns {given}: needs x, y and z, each name once, such as x,y,z,intensity,ring")
+    return names
 
 
 def registration_parameter(f: Field) -> Parameter:

@@ -16,6 +16,7 @@ from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
 from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
+from fmr_cli.vectors import unturned
 
 # suffix -> (module that reads and writes it, format as PointCloud.format)
 FORMATS = {
@@ -130,9 +131,12 @@ def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
     stream = stream_of(cloud)
     if stream.survey.count == 0:
         raise CloudFileError(f"{path}: there are no points to write")
+    head = stream.survey.head
+    warnings = [f"{what} of {stream.name}: not kept" for what in head.left_out]
+    warnings += unturned(head.attributes) if stream.turned else []
     with atomic_write(path) as temporary:
         try:
-            return module.write(temporary, stream)
+            return warnings + module.write(temporary, stream)
         except CloudFileError as error:
             if str(error).startswith(str(stream.name)):  # of reading it again
                 raise

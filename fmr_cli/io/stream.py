@@ -68,18 +68,25 @@ class CloudStream:
     """The points of a cloud in order, as clouds of at most some CHUNK points each. Can be run through again.
 
     All chunks have the same attributes of the same types, and say the same of the whole but for ``dropped``, and
-    where a file has several scans, ``scan``, ``T_file_scan`` and ``sensor_origin``.
+    where a file has several scans, ``scan``, ``T_file_scan`` and ``sensor_origin``. turned: whether it is in another
+    orientation than its file, so that a write has to warn of what did not turn along.
     """
 
-    def __init__(self, chunks: Callable[[], Iterator[PointCloud]], name: str) -> None:
-        self.chunks, self.name = chunks, name
+    def __init__(self, chunks: Callable[[], Iterator[PointCloud]], name: str, turned: bool = False) -> None:
+        self.chunks, self.name, self.turned = chunks, name, turned
 
     def __iter__(self) -> Iterator[PointCloud]:
         return self.chunks()
 
     def map(self, function: Callable[[PointCloud], PointCloud]) -> CloudStream:
         """Each chunk as the function returns it."""
-        return CloudStream(lambda: map(function, self.chunks()), self.name)
+        return CloudStream(lambda: map(function, self.chunks()), self.name, self.turned)
+
+    def transformed(self, T: np.ndarray) -> CloudStream:
+        """The cloud moved by T (4x4), as ``PointCloud.transformed``."""
+        moved = self.map(lambda cloud: cloud.transformed(T))
+        moved.turned = self.turned or not np.array_equal(T[:3, :3], np.eye(3))
+        return moved
 
     @cached_property
     def survey(self) -> Survey:

@@ -1,68 +1,128 @@
-"""What a registration leaves behind besides its transform: moved and merged clouds, metrics, a summary."""
+"""What a registration leaves behind besides its transform: moved and merged clouds, metrics, a summary.
+
+Clouds go from file to file a chunk at a time, so that their size does not matter.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
+from fmr_cli.io.stream import COLORS, CloudStream, Column, Survey, collect, stream_of
 from fmr_cli.registration.result import Registration
 
-COLOURS = ("red", "green", "blue", "alpha")
-CHUNK = 1 << 20  # points whose neighbours are looked up at a time
+INDEXED = 2_000_000  # points of the target, at least, that residuals are measured to: some 300 MB with their tree
 
 
-def aligned_cloud(source: PointCloud, target: PointCloud, T: np.ndarray) -> PointCloud:
-    """The source moved by T, with all its attributes and ``residual``: the distance to the nearest target point."""
+def aligned_cloud(source: PointCloud | CloudStream, target: PointCloud | CloudStream, T: np.ndarray) -> CloudStream:
+    """The source moved by T, with all its attributes and ``residual``: the distance to the nearest target point.
+
+    Of a target of more than twice INDEXED points, the nearest of those that an even thinning keeps.
+    """
     from scipy.spatial import cKDTree
 
-    moved = source.transformed(T)
-    moved.crs = target.crs or source.crs
-    origin = target.points.mean(0)
-    tree = cKDTree(target.points - origin)
-    residual = np.empty(len(moved), np.float32)
-    for start in range(0, len(moved), CHUNK):
-        part = slice(start, start + CHUNK)
-        residual[part] = tree.query(moved.points[part] - origin, workers=-1)[0]
-    return moved.with_attribute("residual", residual)
+    index = collect((PointCloud(c.points, crs=c.crs) for c in stream_of(target)), INDEXED)
+    origin = index.points.mean(0)
+    tree = cKDTree(index.points - origin)
+    moved = stream_of(source).transformed(T).map(lambda c: replace(c, crs=index.crs or c.crs))
+
+    def with_residual(cloud: PointCloud) -> PointCloud:
+        distance = tree.query(cloud.points - origin, workers=-1)[0]
+        return cloud.with_attribute("residual", distance.astype(np.float32))
+
+    # What has to be known of residuals before they are written is so little that they are computed once only.
+    survey = moved.survey
+    anything = Column(np.dtype(np.float32), (), -np.inf, np.inf, whole=False)
+    aligned = moved.map(with_residual)
+    head = survey.head.with_attribute("residual", np.empty(0, np.float32))
+    aligned.survey = replace(survey, head=head, columns={**survey.columns, "residual": anything})
+    return aligned
 
 
-def merged_cloud(source: PointCloud, target: PointCloud, T: np.ndarray) -> tuple[PointCloud, list[str]]:
+def merged_cloud(
+    source: PointCloud | CloudStream, target: PointCloud | CloudStream, T: np.ndarray
+) -> tuple[CloudStream, list[str]]:
     """Both clouds in the target's frame with ``source_id`` (0 source, 1 target), and warnings about attributes.
 
     An attribute that only one of them has is 0 for the other's points; one of two widths is left out.
     """
-    clouds = (source.transformed(T), target)
-    attributes, warnings = {}, []
-    for name in dict.fromkeys([*clouds[0].attributes, *target.attributes]):
-        present = [cloud.attributes[name] for cloud in clouds if name in cloud.attributes]
-        if len({values.shape[1:] for values in present}) > 1:
+    streams = (stream_of(source).transformed(T), stream_of(target))
+    first, second = (stream.survey for stream in streams)
+    columns: dict[str, Column] = {}
+    warnings = []
+    for name in dict.fromkeys([*first.columns, *second.columns]):
+        present = [survey.columns[name] for survey in (first, second) if name in survey.columns]
+        if len({column.shape for column in present}) > 1:
             warnings.append(f"attribute {name!r} has a different width in the two clouds: left out of the merged cloud")
             continue
-        parts = [
-            cloud.attributes[name] if name in cloud.attributes else np.zeros((len(cloud), *present[0].shape[1:]), "u1")
-            for cloud in clouds
-        ]
-        if name in COLOURS and {values.dtype for values in present} == {np.dtype(np.uint8), np.dtype(np.uint16)}:
-            parts = [part.astype(np.uint16) * 257 if part.dtype == np.uint8 else part for part in parts]
-        attributes[name] = np.concatenate([part.astype(np.result_type(*present), copy=False) for part in parts])
+        columns[name] = merged_column(name, present)
         if len(present) == 1:
-            lacking = next(cloud for cloud in (source, target) if name not in cloud.attributes)
-            warnings.append(f"attribute {name!r} is not in {lacking.name}: 0 for its points in the merged cloud")
-    attributes["source_id"] = np.repeat(np.array([0, 1], np.uint8), [len(source), len(target)])
-    points = np.concatenate([cloud.points for cloud in clouds])
-    return replace(
-        target, points=points, attributes=attributes, sensor_origin=None,
-        crs=target.crs or source.crs, las_header=target.las_header or source.las_header,
-    ), warnings  # fmt: skip
+            lacking = next(s.name for s in streams if name not in s.survey.columns)
+            warnings.append(f"attribute {name!r} is not in {lacking}: 0 for its points in the merged cloud")
+    own = columns | {"source_id": Column(np.dtype(np.uint8), (), 0, 1, by_257=False)}
+    head = replace(
+        second.head, attributes={n: np.empty((0, *c.shape), c.dtype) for n, c in own.items()}, sensor_origin=None,
+        crs=second.head.crs or first.head.crs, las_header=second.head.las_header or first.head.las_header,
+        left_out=tuple(dict.fromkeys((*first.head.left_out, *second.head.left_out))), scan=None, T_file_scan=None,
+    )  # fmt: skip
+
+    def chunks() -> Iterator[PointCloud]:
+        for number, stream in enumerate(streams):
+            for cloud in stream:
+                attributes = {n: merged_values(n, c, cloud, stream.survey) for n, c in columns.items()}
+                attributes["source_id"] = np.full(len(cloud), number, np.uint8)
+                yield replace(head, points=cloud.points, attributes=attributes)
+
+    merged = CloudStream(chunks, streams[1].name, turned=streams[0].turned)
+    merged.survey = Survey(
+        head, first.count + second.count, np.minimum(first.low, second.low), np.maximum(first.high, second.high),
+        max(first.rest, second.rest), own,
+    )  # fmt: skip
+    return merged, warnings
+
+
+def merged_column(name: str, present: list[Column]) -> Column:
+    """What the values of one attribute of both clouds, or of one and zeros, have in common."""
+    wide = [widened(column) for column in present] if mixed_colors(name, present) else present
+    low, high = min(c.low for c in wide), max(c.high for c in wide)
+    if len(present) == 1:
+        low, high = min(low, 0), max(high, 0)
+    return Column(
+        np.result_type(*(c.dtype for c in wide)), wide[0].shape, low, high, all(c.whole for c in wide),
+        sum(c.missing for c in wide), all(c.by_257 for c in wide),
+    )  # fmt: skip
+
+
+def mixed_colors(name: str, present: list[Column]) -> bool:
+    return name in (*COLORS, "alpha") and {c.dtype for c in present} == {np.dtype(np.uint8), np.dtype(np.uint16)}
+
+
+def widened(column: Column) -> Column:
+    """8-bit colours as 16-bit ones."""
+    if column.dtype == np.uint16:
+        return column
+    return replace(column, dtype=np.dtype(np.uint16), low=column.low * 257, high=column.high * 257)
+
+
+def merged_values(name: str, column: Column, cloud: PointCloud, survey: Survey) -> np.ndarray:
+    """An attribute of one of the clouds in the type it has in the merged one."""
+    values = cloud.attributes.get(name)
+    if values is None:
+        return np.zeros((len(cloud), *column.shape), column.dtype)
+    own = survey.columns[name].dtype
+    if name in (*COLORS, "alpha") and own == np.uint8 and column.dtype == np.uint16:
+        return values.astype(np.uint16) * np.uint16(257)
+    return values.astype(column.dtype, copy=False)
 
 
 def metrics(source: PointCloud, target: PointCloud, found: Registration) -> dict[str, Any]:
     """Everything said about a registration, with the files it is about; plain JSON types."""
     files = {
-        role: {"file": cloud.name, "points": len(cloud), "dropped": cloud.dropped}
+        role: {"file": cloud.name, "points": cloud.count, "dropped": cloud.dropped}
         for role, cloud in (("source", source), ("target", target))
     }
     return {**files, **found.to_dict()}
@@ -82,4 +142,6 @@ def summary(source: PointCloud, target: PointCloud, found: Registration) -> list
     for cloud in (source, target):
         if cloud.dropped:
             lines.append(f"{cloud.name}: {cloud.dropped} points without finite coordinates are left out")
+        if cloud.layout:
+            lines.append(f"{cloud.name}: {cloud.layout}")
     return lines
