@@ -70,7 +70,7 @@ class CloudCache:
 
     def _keep_within_bound(self) -> None:
         with self.lock:
-            read = {key: f.result().read for key, f in self.files.items() if f.done() and not f.exception()}
+            read = {key: len(f.result().points) for key, f in self.files.items() if f.done() and not f.exception()}
             held = sum(read.values())
             for key, points in read.items():
                 if held > self.at_most:

@@ -186,7 +186,7 @@ def read_header(file: BinaryIO) -> Header:
                 case ["end_header", *_]:
                     break
                 case ["ply"] | [""]:
-                    pass
+                    continue
                 case ["comment", ("crs" | "sensor_origin") as key, *_]:
                     comments[key] = line.split(maxsplit=2)[2] if len(words) > 2 else ""
                 case ["comment" | "obj_info", *_]:

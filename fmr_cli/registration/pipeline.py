@@ -23,6 +23,7 @@ from fmr_cli.registration.confidence import Judge
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
+from fmr_cli.registration.plausible import unit_hint
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration, Stopwatch, describe
 
@@ -71,6 +72,9 @@ def align(
                 best = replace(best, T_target_source=refinement.exact(judge.pair, T))
         with time.stage("verdict"):
             found = describe(judge.pair, best, judge.candidates[1:], source, factor, options)
+    found.warnings += [*source.notes, *target.notes]
+    if found.status != "aligned" and not options.scale and (hint := unit_hint(source.points, target.points)):
+        found.warnings.append(hint)
     found.seconds = time.seconds
     return found
 

@@ -13,6 +13,7 @@ from fmr_cli.geometry.sampling import distinct, sample, thinned, working_scale
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.registration.memo import Memo
+from fmr_cli.registration.plausible import without_far_points
 
 MIN_POINTS = 10  # fewer say nothing about a surface
 AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more in every voxel
@@ -25,14 +26,16 @@ class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, within bounds, for its next pair.
 
     points: (N, 3) float64, centred, at most AT_MOST, finite and distinct. frame: the centred coordinates, whose origin
-    is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. Raises
+    is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. notes:
+    what a person should know of it. Raises
     RegistrationError: fewer than 10 distinct points, all in one place.
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         points = thinned(cloud.points, AT_MOST, rng)
-        points = points[np.isfinite(points).all(1)]
+        points, far = without_far_points(points[np.isfinite(points).all(1)])
+        self.notes = [] if far is None else [f"{cloud.name}: {far}"]
         self.frame = Frame(points.mean(0) if len(points) else np.zeros(3))
         points = distinct(self.frame.enter(points))
         if len(points) == 1 and len(cloud) > 1:
@@ -41,7 +44,7 @@ class Prepared:
             raise RegistrationError(
                 f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
             )
-        self.name, self.read, self.seed = cloud.name, len(cloud), seed
+        self.name, self.read, self.seed = cloud.name, cloud.count, seed
         self.points = points
         self.edge, self.spacing = working_scale(self.points, rng)
         self._surfaces, self._described, self._fine, self._gicp = (Memo(KEPT) for _ in range(4))
