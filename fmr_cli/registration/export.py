@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
+from fmr_cli.geometry.nearest import NearestDistance
 from fmr_cli.io.stream import COLORS, CloudStream, Column, Survey, collect, stream_of
 from fmr_cli.registration.result import Registration
 
@@ -23,16 +24,12 @@ def aligned_cloud(source: PointCloud | CloudStream, target: PointCloud | CloudSt
 
     Of a target of more than twice INDEXED points, the nearest of those that an even thinning keeps.
     """
-    from scipy.spatial import cKDTree
-
     index = collect((PointCloud(c.points, crs=c.crs) for c in stream_of(target)), INDEXED)
-    origin = index.points.mean(0)
-    tree = cKDTree(index.points - origin)
+    distance = NearestDistance(index.points)
     moved = stream_of(source).transformed(T).map(lambda c: replace(c, crs=index.crs or c.crs))
 
     def with_residual(cloud: PointCloud) -> PointCloud:
-        distance = tree.query(cloud.points - origin, workers=-1)[0]
-        return cloud.with_attribute("residual", distance.astype(np.float32))
+        return cloud.with_attribute("residual", distance(cloud.points).astype(np.float32))
 
     # What has to be known of residuals before they are written is so little that they are computed once only.
     survey = moved.survey
