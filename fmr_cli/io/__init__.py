@@ -14,6 +14,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
+from fmr_cli.io.parts import ScanPart
 from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
 from fmr_cli.vectors import unturned
@@ -30,6 +31,8 @@ FORMATS = {
     ".asc": ("text", "xyz"),
     ".csv": ("text", "csv"),
     ".pts": ("text", "pts"),
+    ".ptx": ("ptx", "ptx"),
+    ".e57": ("e57", "e57"),
     ".npy": ("numpy_files", "npy"),
     ".npz": ("numpy_files", "npz"),
     ".off": ("mesh", "mesh"),
@@ -50,6 +53,7 @@ __all__ = [
     "read_cloud",
     "read_poses",
     "read_transform",
+    "scans_of",
     "transform_text",
     "write_cloud",
     "write_poses",
@@ -119,6 +123,20 @@ def read_cloud(
         seed,
     )
     return cloud
+
+
+def scans_of(path: str | Path) -> list[ScanPart]:
+    """The scans of a file with their names and poses; of most formats one, in the file's own frame.
+
+    Its name is then empty. Each but that is read by ``FILE#number``, numbers from 1. Raises CloudFileError.
+    """
+    path = Path(path)
+    module, _, file, part = find_module(path, SUFFIXES)
+    if module.__name__.rsplit(".", 1)[1] not in PARTED or part is not None:
+        return [ScanPart("", np.eye(4), 0)]
+    check_readable(file)
+    with naming(file):
+        return module.scans(file)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
