@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from fmr_cli.vectors import turn_vectors
+
 if TYPE_CHECKING:
     from torch import Tensor
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
 
 NORMALS = ("nx", "ny", "nz")
-PULSE = ("x_t", "y_t", "z_t")  # the direction of a LAS waveform, in coordinates per picosecond
 
 
 @dataclass
@@ -24,13 +25,17 @@ class PointCloud:
     points: (N, 3) float64, in the file's own unit and frame; every coordinate finite.
     attributes: name -> (N,) or (N, k) array in the file's own dtype. Names are unified over the formats:
         ``red green blue alpha``, ``nx ny nz``, ``intensity``; every other field keeps the file's name.
-    path, format: where the cloud came from ("ply", "pcd", "las", "laz", "kitti", "xyz", "csv", "npy", "npz", "mesh").
+    path, format: where the cloud came from ("ply", "pcd", "las", "laz", "e57", "kitti", "xyz", "csv", "npy", "npz",
+        "mesh", ...). layout: what a reader made out by the values ("x y z intensity ring"), or None.
     dropped: how many points of the file were left out because a coordinate was NaN or infinite.
+    total: how many points the file has besides those dropped, where only some of them were kept; else None.
     crs: the coordinate reference system as the file states it (WKT or "EPSG:n"), or None.
     sensor_origin: (3,) float64 position of the sensor where the file states it, or None.
     las_header: the ``laspy.LasHeader`` of a LAS/LAZ file (scales, offsets, VLRs), so that it can be written again.
     left_out: what else the file holds and is not kept ("list property 'neighbours'", "element 'edge'").
     mesh: (vertices, faces) of the mesh whose surface was sampled, or None.
+    scan, T_file_scan: of a file of several scans, the name of the one that the points are from, and its pose in the
+        file's frame (4x4), in which the points are; None where the file tells no scans apart.
     """
 
     points: np.ndarray
@@ -43,6 +48,10 @@ class PointCloud:
     las_header: Any = None
     left_out: tuple[str, ...] = ()
     mesh: tuple[int, int] | None = None
+    layout: str | None = None
+    total: int | None = None
+    scan: str | None = None
+    T_file_scan: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.points = np.asarray(self.points, dtype=np.float64)
@@ -56,12 +65,17 @@ class PointCloud:
         return len(self.points)
 
     @property
+    def count(self) -> int:
+        """How many points the file has, besides those dropped."""
+        return len(self) if self.total is None else self.total
+
+    @property
     def name(self) -> str:
         """The file's path for messages, or a placeholder for a cloud made in memory."""
         return str(self.path) if self.path else "<cloud in memory>"
 
-    def select(self, index: np.ndarray) -> PointCloud:
-        """The points (and their attributes) at an index array or boolean mask of shape (N,)."""
+    def select(self, index: np.ndarray | slice) -> PointCloud:
+        """The points (and their attributes) at an index array, a boolean mask of shape (N,), or a slice."""
         return replace(
             self, points=self.points[index], attributes={name: v[index] for name, v in self.attributes.items()}
         )
@@ -73,20 +87,17 @@ class PointCloud:
     def transformed(self, T: np.ndarray) -> PointCloud:
         """The cloud moved by T (4x4, float64, rigid or with a uniform scale s): x -> s R x + t.
 
-        Normals are rotated, not scaled; LAS pulse directions and the sensor's position move along.
+        Attributes that are vectors move along (`fmr_cli.vectors`), and so do the sensor's position and the scan's pose.
         """
-        moved = replace(self, points=transform_points(T, self.points), attributes=dict(self.attributes))
+        moved = replace(self, points=transform_points(T, self.points), attributes=turn_vectors(self.attributes, T))
         scale = np.cbrt(np.linalg.det(T[:3, :3]))
-        for names, block in ((NORMALS, T[:3, :3] / scale), (PULSE, T[:3, :3])):
-            if all(name in self.attributes for name in names):
-                vectors = np.stack([self.attributes[name] for name in names], 1).astype(np.float64) @ block.T
-                for axis, name in enumerate(names):
-                    moved.attributes[name] = vectors[:, axis].astype(self.attributes[name].dtype)
         if self.las_header is not None and abs(scale - 1) > 1e-6:
             moved.las_header = self.las_header.copy()
             moved.las_header.scales = self.las_header.scales * scale  # as many steps across the cloud as before
         if self.sensor_origin is not None:
             moved.sensor_origin = transform_points(T, self.sensor_origin[None])[0]
+        if self.T_file_scan is not None:
+            moved.T_file_scan = T @ self.T_file_scan
         return moved
 
 

@@ -6,13 +6,12 @@ import threading
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from fmr_cli.cloud import PointCloud
 from fmr_cli.io import read_cloud
 from fmr_cli.registration import Prepared, prepare
+from fmr_cli.registration.prepared import AT_MOST
 
 # Points of the files that are kept for later pairs: about 2 GB with what is prepared from them (100 bytes a point).
 CACHED_POINTS = 20_000_000
@@ -23,15 +22,6 @@ class Key(NamedTuple):
 
     path: Path
     seed: int
-    attributes: bool
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """A file made ready for registration; the cloud itself only where it is to be written again."""
-
-    prepared: Prepared
-    cloud: PointCloud | None
 
 
 class CloudCache:
@@ -44,7 +34,7 @@ class CloudCache:
     def __init__(self, at_most: int = CACHED_POINTS) -> None:
         self.at_most = at_most
         self.needed: Counter[Path] = Counter()  # how many pairs are still to come that need it
-        self.files: OrderedDict[Key, Future[Loaded]] = OrderedDict()
+        self.files: OrderedDict[Key, Future[Prepared]] = OrderedDict()
         self.lock = threading.Lock()
 
     def expect(self, paths: Iterable[Path]) -> None:
@@ -52,20 +42,19 @@ class CloudCache:
         with self.lock:
             self.needed.update(paths)
 
-    def get(self, path: Path, *, seed: int, attributes: bool) -> Loaded:
+    def get(self, path: Path, *, seed: int) -> Prepared:
         """A file's cloud; where it could not be read, the same error each time.
 
-        attributes: the cloud is to be written again. seed: of the sample that is looked at where the file is large.
+        seed: of the sample that is looked at where the file is large.
         """
-        key = Key(path, seed, attributes)
+        key = Key(path, seed)
         with self.lock:
             known = self.files.get(key)
             future = self.files.setdefault(key, known or Future())
             self.files.move_to_end(key)
         if known is None:
             try:
-                cloud = read_cloud(path, attributes=attributes)
-                future.set_result(Loaded(prepare(cloud, seed), cloud if attributes else None))
+                future.set_result(prepare(read_cloud(path, attributes=False, at_most=AT_MOST), seed))
             except BaseException as error:
                 future.set_exception(error)
             self._keep_within_bound()
@@ -81,7 +70,7 @@ class CloudCache:
 
     def _keep_within_bound(self) -> None:
         with self.lock:
-            read = {key: f.result().prepared.read for key, f in self.files.items() if f.done() and not f.exception()}
+            read = {key: len(f.result().points) for key, f in self.files.items() if f.done() and not f.exception()}
             held = sum(read.values())
             for key, points in read.items():
                 if held > self.at_most:

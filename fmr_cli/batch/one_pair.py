@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from fmr_cli.batch.cache import CloudCache, Loaded
+from fmr_cli.batch.cache import CloudCache
 from fmr_cli.batch.manifest import Pair
 from fmr_cli.batch.results import COLUMNS
-from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import FmrError, ModelError
-from fmr_cli.io import WRITABLE, write_cloud, write_transform
+from fmr_cli.io import WRITABLE, open_cloud, write_cloud, write_transform
 from fmr_cli.io.files import reason
 from fmr_cli.registration import Options, Registration, align
 from fmr_cli.registration.export import aligned_cloud, merged_cloud
@@ -57,28 +56,24 @@ class PairRunner:
 
     def _registered(self, pair: Pair) -> dict[str, Any]:
         options = replace(self.options, init=read_init(pair.init, self.folder)) if pair.init else self.options
-        source, target = map(self._loaded, self.files(pair))
-        found = align(source.prepared, target.prepared, options, threads=1)
-        warnings = [*found.warnings, *self._write_clouds(pair, source.cloud, target.cloud, found.T_target_source)]
+        source, target = (self.cache.get(path, seed=self.options.seed) for path in self.files(pair))
+        found = align(source, target, options, threads=1)
+        warnings = [*found.warnings, *self._write_clouds(pair, found.T_target_source)]
         transform = f"transforms/{pair.name}.txt"
         write_transform(self.out / transform, found.T_target_source)
         return described(found) | {"transform": transform, "message": "; ".join(warnings)}
 
-    def _loaded(self, path: Path) -> Loaded:
-        return self.cache.get(path, seed=self.options.seed, attributes=self.aligned or self.merged)
-
-    def _write_clouds(
-        self, pair: Pair, source: PointCloud | None, target: PointCloud | None, T_target_source: np.ndarray
-    ) -> list[str]:
+    def _write_clouds(self, pair: Pair, T_target_source: np.ndarray) -> list[str]:
         """Writes the clouds that are wanted; returns warnings about what a format cannot hold."""
-        if source is None or target is None:
-            return []
-        warnings = []
+        warnings: list[str] = []
+        source, target = self.files(pair)
         if self.aligned:
             path = self.out / "aligned" / f"{pair.name}{suffix_for(source)}"
-            warnings += write_cloud(path, aligned_cloud(source, target, T_target_source))
+            warnings += write_cloud(
+                path, aligned_cloud(open_cloud(source), open_cloud(target, attributes=False), T_target_source)
+            )
         if self.merged:
-            merged, said = merged_cloud(source, target, T_target_source)
+            merged, said = merged_cloud(open_cloud(source), open_cloud(target), T_target_source)
             warnings += said + write_cloud(self.out / "merged" / f"{pair.name}{suffix_for(target)}", merged)
         return warnings
 
@@ -94,7 +89,7 @@ def described(found: Registration) -> dict[str, str]:
     }
 
 
-def suffix_for(cloud: PointCloud) -> str:
-    """The suffix of the cloud's file where that format can hold more attributes, or .ply."""
-    suffix = cloud.path.suffix.lower() if cloud.path else ""
-    return suffix if suffix in WRITABLE and suffix != ".bin" else ".ply"
+def suffix_for(path: Path) -> str:
+    """The suffix of a cloud's file where that format can hold all attributes, or .ply."""
+    suffix = path.suffix.lower()
+    return suffix if suffix in WRITABLE and suffix not in (".bin", ".npy", ".pts") else ".ply"

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from fmr_cli.cli.console import UNCERTAIN, busy, quick_imports, say, show_log, warn
-from fmr_cli.cli.options import Verbose, takes_registration_options
+from fmr_cli.cli.console import UNCERTAIN, busy, points_bar, quick_imports, say, show_log, warn
+from fmr_cli.cli.options import BinColumns, Verbose, columns, takes_registration_options
 from fmr_cli.registration.options import Options
 
 
@@ -26,6 +26,7 @@ def align_command(
     metrics: Annotated[Path | None, typer.Option(help="Everything said about the result, as .json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the metrics to stdout, not the matrix.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
+    bin_columns: BinColumns = None,
     verbose: Verbose = 0,
 ) -> None:
     """Find the transform that moves SOURCE onto TARGET."""
@@ -37,17 +38,25 @@ def align_command(
         (out, (".txt", ".npy", ".json")), (aligned, io.WRITABLE), (merged, io.WRITABLE), (metrics, (".json",)),
     ])  # fmt: skip
     with busy(f"registering {source.name} onto {target.name}", quiet):
-        moving = io.read_cloud(source, attributes=bool(aligned or merged))
-        fixed = io.read_cloud(target, attributes=bool(merged))
+        from fmr_cli.registration.prepared import AT_MOST
+
+        named = columns(bin_columns)
+        moving, fixed = (
+            io.read_cloud(path, attributes=False, at_most=AT_MOST, bin_columns=named) for path in (source, target)
+        )
         with quick_imports():  # after reading: a bad file is said at once
             from fmr_cli.registration import align, export
         found = align(moving, fixed, options)
     T, said, warnings = found.T_target_source, export.metrics(moving, fixed, found), [*found.warnings]
+    files = [io.open_cloud(path, bin_columns=named) for path in (source, target)]
     if aligned:
-        warnings += io.write_cloud(aligned, export.aligned_cloud(moving, fixed, T))
+        with points_bar("writing the moved source", quiet) as count:
+            cloud = export.aligned_cloud(files[0], io.open_cloud(target, attributes=False, bin_columns=named), T)
+            warnings += io.write_cloud(aligned, count(cloud))
     if merged:
-        cloud, lacking = export.merged_cloud(moving, fixed, T)
-        warnings += lacking + io.write_cloud(merged, cloud)
+        with points_bar("writing both clouds", quiet) as count:
+            cloud, lacking = export.merged_cloud(files[0], files[1], T)
+            warnings += lacking + io.write_cloud(merged, count(cloud))
     if metrics:
         outputs.write_json(metrics, said)
     if out:

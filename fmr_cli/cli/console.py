@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import gc
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, TaskID
+
+    from fmr_cli.cloud import PointCloud
+    from fmr_cli.io.stream import CloudStream
 
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -68,6 +71,34 @@ def progress(quiet: bool, *, counted: bool = True) -> Progress:
     left = (MofNCompleteColumn(), TimeRemainingColumn()) if counted else ()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), *left)
     return Progress(*columns, TextColumn("{task.fields[said]}"), console=err, disable=quiet or not err.is_terminal)
+
+
+@contextmanager
+def points_bar(text: str, quiet: bool) -> Iterator[Callable[[CloudStream], CloudStream]]:
+    """A bar of the points that are read or written: the stream as the block's function returns it moves it.
+
+    How many there will be is known once the stream has been surveyed, which is done here.
+    """
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+               TextColumn("{task.fields[said]}"))  # fmt: skip
+    with Progress(*columns, console=err, transient=True, disable=quiet or not err.is_terminal) as bar:
+
+        def count(stream: CloudStream) -> CloudStream:
+            task = bar.add_task(text, total=None, said="looking at all points")
+            counted = stream.map(lambda cloud: moved(task, cloud))
+            counted.survey = stream.survey
+            bar.update(task, total=counted.survey.count, completed=0)
+            return counted
+
+        def moved(task: TaskID, cloud: PointCloud) -> PointCloud:
+            bar.advance(task, len(cloud))
+            speed = bar.tasks[0].speed
+            bar.update(task, said=f"{speed / 1e6:.1f} million points a second" if speed else "")
+            return cloud
+
+        yield count
 
 
 @contextmanager

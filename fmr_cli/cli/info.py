@@ -8,22 +8,25 @@ from typing import Annotated
 
 import typer
 
-from fmr_cli.cli.console import BAD_INPUT, complain
+from fmr_cli.cli.console import BAD_INPUT, busy, complain
+from fmr_cli.cli.options import BinColumns, columns
 from fmr_cli.errors import FmrError
 
 
 def info_command(
     files: Annotated[list[Path], typer.Argument(help="Clouds or meshes.", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON array, one object a file.")] = False,
+    bin_columns: BinColumns = None,
 ) -> None:
-    """Say what is in each of the FILES."""
+    """Say what is in each of the FILES. FILE#2 or FILE#name is one scan of a file that holds several."""
     from fmr_cli import io
     from fmr_cli.io.describe import describe, table
 
     found = []
     for path in files:
         try:
-            found.append(describe(io.read_cloud(path)))
+            with busy(f"reading {path.name}", as_json):
+                found.append(describe(io.open_cloud(path, bin_columns=columns(bin_columns))))
         except FmrError as error:
             complain(error)
             continue

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fmr_cli.errors import FmrError
 from fmr_cli.registration.options import Options, flag, read_init
 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
@@ -18,6 +19,23 @@ Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, help="Say what was decided and why; -vv says more.")
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Where an error comes from, as a traceback.")]
+BinColumns = Annotated[
+    str | None,
+    typer.Option(help="What the float32 of a .bin are, such as x,y,z,intensity,ring; told by the values if not given."),
+]
+
+
+def columns(given: str | None) -> tuple[str, ...] | None:
+    """--bin-columns as names. Raises FmrError where x, y and z are not among them, or a name is there twice."""
+    if given is None:
+        return None
+    names = tuple(name.strip() for name in given.split(","))
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names) or not all(names):
+        raise FmrError(f"--bin-columns {given}: needs x, y and z, each name once, such as x,y,z,intensity,ring")
+    return names
+
+
+ALL_OPTIONS = tuple(field.name for field in fields(Options))
 
 
 def registration_parameter(f: Field) -> Parameter:
@@ -29,9 +47,7 @@ def registration_parameter(f: Field) -> Parameter:
     return Parameter(f.name, Parameter.KEYWORD_ONLY, default=f.default, annotation=Annotated[kind, info])
 
 
-def takes_registration_options(
-    command: Callable, names: Sequence[str] = tuple(f.name for f in fields(Options))
-) -> Callable:
+def takes_registration_options(command: Callable, names: Sequence[str] = ALL_OPTIONS) -> Callable:
     """Gives a command the options of a registration, or those named; they come to it as one argument, ``options``."""
 
     def run(**given: Any) -> None:

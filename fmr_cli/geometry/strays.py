@@ -77,7 +77,7 @@ def on_a_shell(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         outer = some[distance >= np.quantile(distance, 1 - share)]
         outer = outer[rng.permutation(len(outer))[:SHELL_SAMPLE]]
         drawn = [sphere(outer[rng.choice(len(outer), 4, replace=False)]) for _ in range(SHELL_DRAWS)]
-        centre, radius = max(drawn, key=lambda ball: on(outer, *ball, 2 * SHELL).sum())
+        centre, radius = max(drawn, key=lambda ball: on(outer, ball[0], ball[1], 2 * SHELL).sum())
         near = on(outer, centre, radius, 2 * SHELL)
         if near.sum() < len(outer) / 3:
             continue

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -12,7 +14,10 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
+from fmr_cli.io.parts import ScanPart
+from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
+from fmr_cli.vectors import unturned
 
 # suffix -> (module that reads and writes it, format as PointCloud.format)
 FORMATS = {
@@ -20,26 +25,35 @@ FORMATS = {
     ".pcd": ("pcd", "pcd"),
     ".las": ("las", "las"),
     ".laz": ("las", "laz"),
-    ".bin": ("kitti", "kitti"),
+    ".bin": ("bin_files", "kitti"),
     ".xyz": ("text", "xyz"),
     ".txt": ("text", "xyz"),
+    ".asc": ("text", "xyz"),
     ".csv": ("text", "csv"),
+    ".pts": ("text", "pts"),
+    ".ptx": ("ptx", "ptx"),
+    ".e57": ("e57", "e57"),
     ".npy": ("numpy_files", "npy"),
     ".npz": ("numpy_files", "npz"),
     ".off": ("mesh", "mesh"),
     ".obj": ("mesh", "mesh"),
     ".stl": ("mesh", "mesh"),
 }
-SUFFIXES = tuple(FORMATS)
-WRITABLE = tuple(suffix for suffix, (module, _) in FORMATS.items() if module != "mesh")
+PARTED = ("e57", "ptx")  # modules whose files may hold several scans
+PACKED = tuple(f"{suffix}.gz" for suffix, (module, _) in FORMATS.items() if module == "text")
+SUFFIXES = (*FORMATS, *PACKED)
+WRITABLE = tuple(suffix for suffix, (module, _) in FORMATS.items() if module not in ("mesh",))
 
 __all__ = [
     "SUFFIXES",
     "WRITABLE",
+    "CloudStream",
     "atomic_write",
+    "open_cloud",
     "read_cloud",
     "read_poses",
     "read_transform",
+    "scans_of",
     "transform_text",
     "write_cloud",
     "write_poses",
@@ -47,55 +61,103 @@ __all__ = [
 ]
 
 
+def open_cloud(
+    path: str | Path,
+    *,
+    mesh_points: int | None = None,
+    seed: int = 0,
+    attributes: bool = True,
+    bin_columns: tuple[str, ...] | None = None,
+) -> CloudStream:
+    """A point cloud to be read a chunk at a time; nothing is read yet, but the file is there. As `read_cloud`."""
+    module, kind, file, part = find_module(Path(path), SUFFIXES)
+    check_readable(file)
+    wanted = Wanted(attributes, part, bin_columns)
+
+    def chunks() -> Iterator[PointCloud]:
+        points = dropped = 0
+        for chunk in guarded(module.read(file, wanted), file):
+            if isinstance(chunk, Mesh):
+                with naming(file):
+                    cloud, form = chunk.sample(mesh_points, seed), "mesh"
+            else:
+                cloud, form = chunk, kind
+            finite = np.isfinite(cloud.points).all(axis=1)
+            bad = int(len(finite) - finite.sum())
+            if bad:
+                cloud = cloud.select(finite)
+            cloud.path, cloud.format, cloud.dropped = Path(path), form, cloud.dropped + bad
+            points, dropped = points + len(cloud), dropped + bad
+            yield cloud
+        if points == 0:
+            what = f"none of its {dropped} points has finite coordinates" if dropped else "holds no points"
+            raise CloudFileError(f"{path}: {what}, check how it was written")
+
+    return CloudStream(chunks, str(path))
+
+
 def read_cloud(
-    path: str | Path, *, mesh_points: int | None = None, seed: int = 0, attributes: bool = True
+    path: str | Path,
+    *,
+    mesh_points: int | None = None,
+    seed: int = 0,
+    attributes: bool = True,
+    at_most: int | None = None,
+    bin_columns: tuple[str, ...] | None = None,
 ) -> PointCloud:
     """Reads a point cloud; points with NaN or infinite coordinates are dropped and counted in ``dropped``.
 
+    path: FILE, or FILE#2 or FILE#name for one scan of a file that holds several.
     mesh_points: how many points to sample from the surface of a mesh; by default as many as it has vertices, at
         least 10,000 and at most 1,000,000. 0 gives the vertices themselves. ``seed`` makes the sample repeatable.
     attributes: False leaves everything but the coordinates in the file, which saves time and memory.
+    at_most: of more than twice as many points, at least so many are kept, spread evenly; ``total`` says how many there
+        are. The memory it takes then depends on this number only.
+    bin_columns: what the numbers of a .bin are, where their values do not tell.
 
     Raises CloudFileError, one line that names the file, for whatever is wrong with it.
     """
-    path = Path(path)
-    module, kind = module_of(path, SUFFIXES)
-    check_readable(path)
-    try:
-        with np.errstate(all="ignore"):
-            cloud = module.read(path, attributes)
-            if isinstance(cloud, Mesh):
-                cloud, kind = cloud.sample(mesh_points, seed), "mesh"
-            finite = np.isfinite(cloud.points).all(axis=1)
-    except CloudFileError as error:
-        raise CloudFileError(f"{path}: {error}") from error
-    except MemoryError as error:
-        raise CloudFileError(f"{path}: does not fit into this machine's memory, thin it out first") from error
-    except Exception as error:
-        raise CloudFileError(f"{path}: cannot be read as {path.suffix} ({reason(error)}), is it damaged?") from error
-    if not finite.any():
-        what = "holds no points" if len(cloud) == 0 else f"none of its {len(cloud)} points has finite coordinates"
-        raise CloudFileError(f"{path}: {what}, check how it was written")
-    dropped = int(len(finite) - finite.sum())
-    if dropped:
-        cloud = cloud.select(finite)
-    cloud.path, cloud.format, cloud.dropped = path, kind, cloud.dropped + dropped
+    cloud = collect(
+        open_cloud(path, mesh_points=mesh_points, seed=seed, attributes=attributes, bin_columns=bin_columns),
+        at_most,
+        seed,
+    )
     return cloud
 
 
-def write_cloud(path: str | Path, cloud: PointCloud) -> list[str]:
-    """Writes a cloud in the format of the suffix and returns warnings: what the format cannot hold.
+def scans_of(path: str | Path) -> list[ScanPart]:
+    """The scans of a file with their names and poses; of most formats one, in the file's own frame.
 
-    A failure leaves whatever was at ``path`` before. Raises CloudFileError.
+    Its name is then empty. Each but that is read by ``FILE#number``, numbers from 1. Raises CloudFileError.
     """
     path = Path(path)
-    module, _ = module_of(path, WRITABLE)
-    if len(cloud) == 0:
+    module, _, file, part = find_module(path, SUFFIXES)
+    if module.__name__.rsplit(".", 1)[1] not in PARTED or part is not None:
+        return [ScanPart("", np.eye(4), 0)]
+    check_readable(file)
+    with naming(file):
+        return module.scans(file)
+
+
+def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
+    """Writes a cloud in the format of the suffix and returns warnings: what the format cannot hold.
+
+    A stream is read twice. A failure leaves whatever was at ``path`` before. Raises CloudFileError.
+    """
+    path = Path(path)
+    module, _, _, _ = find_module(path, WRITABLE)
+    stream = stream_of(cloud)
+    if stream.survey.count == 0:
         raise CloudFileError(f"{path}: there are no points to write")
+    head = stream.survey.head
+    warnings = [f"{what} of {stream.name}: not kept" for what in head.left_out]
+    warnings += unturned(head.attributes) if stream.turned else []
     with atomic_write(path) as temporary:
         try:
-            return module.write(temporary, cloud)
+            return warnings + module.write(temporary, stream)
         except CloudFileError as error:
+            if str(error).startswith(str(stream.name)):  # of reading it again
+                raise
             raise CloudFileError(f"{path}: {error}") from error
         except (OSError, MemoryError):
             raise
@@ -103,11 +165,45 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> list[str]:
             raise CloudFileError(f"{path}: cannot be written as {path.suffix} ({reason(error)})") from error
 
 
-def module_of(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str]:
-    """The module for the path's suffix, which must be among ``suffixes``, and the format's name."""
-    suffix = path.suffix.lower()
-    if suffix not in suffixes:
-        what = f"the suffix {suffix!r} cannot be {'read' if suffixes is SUFFIXES else 'written'}"
-        raise CloudFileError(f"{path}: {what if suffix else 'has no suffix'}, use one of {' '.join(suffixes)}")
-    name, kind = FORMATS[suffix]
-    return importlib.import_module(f"fmr_cli.io.{name}"), kind
+def guarded(chunks: Iterator[PointCloud | Mesh], path: Path) -> Iterator[PointCloud | Mesh]:
+    """The chunks of a reader, and whatever goes wrong as a CloudFileError of one line that names the file."""
+    while True:
+        with naming(path):
+            chunk = next(chunks, None)
+        if chunk is None:
+            return
+        yield chunk
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Turns whatever goes wrong into a CloudFileError that names the file; numpy's warnings are silent meanwhile."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except CloudFileError as error:
+        raise CloudFileError(f"{path}: {error}") from error
+    except MemoryError as error:
+        raise CloudFileError(f"{path}: does not fit into this machine's memory, thin it out first") from error
+    except Exception as error:
+        raise CloudFileError(f"{path}: cannot be read as {path.suffix} ({reason(error)}), is it damaged?") from error
+
+
+def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str, Path, str | None]:
+    """The module for a path's suffix, which must be among ``suffixes``, and the format's name; the file, and the part
+    of it that is meant: FILE#2 is a part of FILE, unless there is a file of that very name.
+    """
+    part = None
+    if "#" in path.name and suffixes is SUFFIXES and not path.exists():
+        name, part = path.name.rsplit("#", 1)
+        path = path.with_name(name)
+    packed = path.suffix.lower() == ".gz"
+    suffix = path.with_suffix("").suffix.lower() if packed else path.suffix.lower()
+    full = f"{suffix}.gz" if packed else suffix
+    if full not in suffixes:
+        what = f"the suffix {full!r} cannot be {'read' if suffixes is SUFFIXES else 'written'}"
+        raise CloudFileError(f"{path}: {what if full else 'has no suffix'}, use one of {' '.join(suffixes)}")
+    module, kind = FORMATS[suffix]
+    if part is not None and module not in PARTED:
+        raise CloudFileError(f"{path}: holds one scan, take the #{part} off its name")
+    return importlib.import_module(f"fmr_cli.io.{module}"), kind, path, part

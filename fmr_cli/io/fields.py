@@ -1,29 +1,64 @@
-"""Named columns, as PLY, PCD, CSV and structured NPY hold them, from and to a PointCloud."""
+"""Named columns, as PLY, PCD, text and structured NPY hold them, from and to a PointCloud."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from itertools import chain
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
 
 from fmr_cli.cloud import NORMALS, PointCloud
 from fmr_cli.errors import CloudFileError
+from fmr_cli.io.stream import COLORS, CloudStream, Column, Survey
 
 ALIASES = {
-    **{axis.upper(): axis for axis in "xyz"},
-    **{f"normal_{axis}": f"n{axis}" for axis in "xyz"},
-    **{f"{prefix}{color}": color for prefix in ("diffuse_", "scalar_") for color in ("red", "green", "blue", "alpha")},
-    **{"r": "red", "g": "green", "b": "blue", "a": "alpha", "R": "red", "G": "green", "B": "blue", "A": "alpha"},
-    **{name: "intensity" for name in ("i", "I", "Intensity", "scalar_intensity", "scalar_Intensity")},
-    **{name: name.lower() for name in ("Red", "Green", "Blue", "Alpha", "Nx", "Ny", "Nz", "NX", "NY", "NZ")},
+    **{f"normal{axis}": f"n{axis}" for axis in "xyz"},
+    **{f"n{axis}": f"n{axis}" for axis in "xyz"},
+    **{f"{prefix}{color}": color for prefix in ("", "diffuse", "scalar") for color in (*COLORS, "alpha")},
+    **{letter: color for letter, color in zip("rgba", (*COLORS, "alpha"), strict=True)},
+    **dict.fromkeys(("i", "intensity", "scalarintensity"), "intensity"),
 }
-COLORS = ("red", "green", "blue")
-CHUNK = 1 << 20  # rows that are put together at a time, so that a large cloud is never in memory twice
+# How programs call the coordinates: as `plain` writes a name
+AXES = {
+    "x": ("x", "xcoord", "xcoordinate", "coordx", "posx", "positionx", "px", "pointx", "points0", "easting", "east",
+          "e", "ostwert", "rechtswert"),
+    "y": ("y", "ycoord", "ycoordinate", "coordy", "posy", "positiony", "py", "pointy", "points1", "northing", "north",
+          "n", "nordwert", "hochwert"),
+    "z": ("z", "zcoord", "zcoordinate", "coordz", "posz", "positionz", "pz", "pointz", "points2", "elevation", "elev",
+          "height", "altitude", "alt", "h", "hoehe", "up"),
+}  # fmt: skip
+LONGITUDES, LATITUDES = {"lon", "long", "lng", "longitude"}, {"lat", "latitude"}
 
 
-def unique(names: list[str]) -> list[str]:
+def plain(name: str) -> str:
+    """A field's name without its unit, quotes and signs, in small letters: "X [m]", "x_coord", "Points:0"."""
+    name = re.sub(r"[\[({].*?[\])}]", "", name.lower()).strip().strip("#/\"'% ")
+    name = re.sub(r"(?<=[a-z])[ _](m|cm|mm|ft|km|metres?|meters?|feet)$", "", name)
+    return re.sub(r"[^a-z0-9]", "", name)
+
+
+def coordinates(names: Iterable[str]) -> list[str] | None:
+    """Which of the names are x, y and z, in that order; the plainest spelling first. None where one is missing."""
+    spelled: dict[str, str] = {}
+    for name in names:
+        spelled.setdefault(plain(name), name)
+    found = [next((spelled[word] for word in words if word in spelled), None) for words in AXES.values()]
+    return None if None in found else [name for name in found if name is not None]
+
+
+def refuse_degrees(names: Iterable[str]) -> None:
+    """Raises CloudFileError where the coordinates are longitude and latitude."""
+    words = {plain(name) for name in names}
+    if words & LONGITUDES and words & LATITUDES:
+        raise CloudFileError(
+            "holds longitude and latitude, and degrees are no lengths: project it first, to UTM say "
+            "(pyproj, `pdal translate --filters.reprojection.out_srs=...`, QGIS)"
+        )
+
+
+def unique(names: Iterable[str]) -> list[str]:
     """The names, repeated ones told apart by a number: a, b, a -> a, b, a_2."""
     seen: set[str] = set()
     result = []
@@ -38,11 +73,14 @@ def unique(names: list[str]) -> list[str]:
 
 
 def unified(names: list[str]) -> dict[str, str]:
-    """Maps each of a file's field names to the name in a PointCloud (see there)."""
-    taken = set(names)
-    mapping = {}
+    """Maps each of a file's field names to the name in a PointCloud (see there), x, y and z among them."""
+    axes = coordinates(names)
+    mapping = dict(zip(axes, "xyz", strict=True)) if axes else {}
+    taken = {*names, *mapping.values()}
     for name in names:
-        alias = ALIASES.get(name, name)
+        if name in mapping:
+            continue
+        alias = ALIASES.get(plain(name), name) if len(name) == 1 or len(plain(name)) > 1 else name
         mapping[name] = name if alias in taken else alias
         taken.add(mapping[name])
     return mapping
@@ -50,6 +88,7 @@ def unified(names: list[str]) -> dict[str, str]:
 
 def to_cloud(columns: Mapping[str, np.ndarray], attributes: bool) -> PointCloud:
     """A cloud of columns of equal length, of which x, y and z must be among them (CloudFileError otherwise)."""
+    refuse_degrees(columns)
     columns = {new: columns[old] for old, new in unified(list(columns)).items()}
     missing = [axis for axis in "xyz" if axis not in columns or columns[axis].ndim != 1]
     if missing:
@@ -66,157 +105,128 @@ def native(values: np.ndarray) -> np.ndarray:
     return np.array(values, dtype=values.dtype.newbyteorder("="))
 
 
-def flat_columns(attributes: Mapping[str, np.ndarray], split: bool) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Attributes as columns named without spaces, and a warning for each that had to be renamed or left out.
+def bare_names(extra: np.ndarray) -> list[str]:
+    """What the columns (N, k) beyond x y z may be where no names are given, told by their values.
 
-    ``split`` turns (N, k) ones into k columns; otherwise they stay (N, k).
+    An odd one before threes is the intensity; a three of integers from 0 to 255 is a colour, one of unit vectors a
+    normal. Anything else is column_4 and so on.
     """
-    columns: dict[str, np.ndarray] = {}
-    warnings = []
-    for name, values in attributes.items():
-        if values.dtype.kind not in "biuf":
-            warnings.append(f"attribute {name!r} is not numeric: left out")
-            continue
-        flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-        plain = "".join(c if c.isascii() and c.isprintable() and c not in " ,;#" else "_" for c in name) or "unnamed"
-        if values.ndim == 1 or not split:
-            parts = {plain: values if values.ndim == 1 else flat}
-        else:
-            parts = {f"{plain}_{k}": flat[:, k] for k in range(flat.shape[1])}
-        given = [unique([*"xyz", *columns, part])[-1] for part in parts]
-        columns.update(zip(given, parts.values(), strict=True))
-        if given != [name]:
-            warnings.append(f"attribute {name!r} is written as {', '.join(given)}")
-    return columns, warnings
+    count = extra.shape[1]
+    generic = [f"column_{4 + k}" for k in range(count)]
+    names = ["intensity"] if count % 3 == 1 else []
+    while len(names) < count:
+        three = extra[:, len(names) : len(names) + 3]
+        kind = NORMALS if are_normals(three) else COLORS if are_colors(three) else None
+        if three.shape[1] < 3 or kind is None or kind[0] in names:
+            return generic
+        names += kind
+    return names
 
 
-def storable(values: np.ndarray, long_integers: bool) -> np.ndarray:
-    """The values in a type that PLY and PCD know: bool as uint8, half as float; 8-byte integers as double for PLY."""
-    if values.dtype.kind == "b":
-        return values.astype(np.uint8)
-    if values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
-        return values.astype(np.float32 if values.dtype.itemsize < 4 else np.float64)
-    if values.dtype.kind in "iu" and values.dtype.itemsize == 8 and not long_integers:
-        return values.astype(np.float64)
-    return values
+def are_colors(three: np.ndarray) -> bool:
+    return bool(((three >= 0) & (three <= 255) & (three == np.rint(three))).all())
 
 
-def bare_cloud(rows: np.ndarray, attributes: bool) -> PointCloud:
-    """A cloud of (N, 3 + k) numbers without names; what the further columns are is told by their values."""
-    if rows.ndim != 2 or rows.shape[1] < 3 or rows.dtype.kind not in "biuf":
-        raise CloudFileError(f"holds an array of {rows.shape} {rows.dtype}, points need (N, 3) numbers or more columns")
-    extra = rows[:, 3:]
+def are_normals(three: np.ndarray) -> bool:
     with np.errstate(all="ignore"):
-        last = extra[:, -3:]
-        are_colors = bool(((last >= 0) & (last <= 255) & (last == np.rint(last))).all())
-        are_normals = bool((np.abs(np.linalg.norm(last, axis=1) - 1) < 0.01).all())
-    match extra.shape[1]:
-        case 1:
-            names: tuple[str, ...] = ("intensity",)
-        case 3 if are_colors:
-            names = COLORS
-        case 3 if are_normals:
-            names = NORMALS
-        case 4 if are_colors:
-            names = ("intensity", *COLORS)
-        case k:
-            names = tuple(f"column_{4 + i}" for i in range(k))
-    kept = {name: native(extra[:, i]) for i, name in enumerate(names)} if attributes else {}
-    return PointCloud(rows[:, :3].astype(np.float64), narrow_colors(kept))
+        length = np.linalg.norm(three.astype(np.float64), axis=1)
+    known = length > 0  # where none could be computed, programs write zeros
+    return bool(known.any() and (np.abs(length[known] - 1) < 0.01).all())
 
 
-def narrow_colors(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Colours that text or plain arrays hold as integers from 0 to 255 (or 65535) in their usual type."""
-    present = [name for name in (*COLORS, "alpha") if name in attributes]
-    values = [attributes[name] for name in present]
-    if not present or not all(((v >= 0) & (v <= 65535) & (v == np.rint(v))).all() for v in values):
-        return attributes
-    kind = np.uint8 if max(v.max(initial=0) for v in values) <= 255 else np.uint16
-    return {**attributes, **{name: attributes[name].astype(kind) for name in present}}
+def bare_cloud(rows: np.ndarray, names: list[str], attributes: bool) -> PointCloud:
+    """A cloud of (N, 3 + k) numbers whose further columns are called ``names``."""
+    kept = {name: native(rows[:, 3 + i]) for i, name in enumerate(names)} if attributes else {}
+    return PointCloud(rows[:, :3].astype(np.float64), kept)
 
 
-def lost_context(cloud: PointCloud, suffix: str) -> list[str]:
+def lost_context(head: PointCloud, suffix: str) -> list[str]:
     """Warnings of a format that has no place for the CRS and the sensor's position."""
-    warnings = [f"{suffix} cannot hold the coordinate reference system: left out"] if cloud.crs else []
-    if cloud.sensor_origin is not None and cloud.sensor_origin.any():
+    warnings = [f"{suffix} cannot hold the coordinate reference system: left out"] if head.crs else []
+    if head.sensor_origin is not None and head.sensor_origin.any():
         warnings.append(f"{suffix} cannot hold the sensor's position: left out")
     return warnings
 
 
-def eight_bit_colors(attributes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """16-bit colours that are 8-bit ones scaled by 257 (as LAS wants them) become 8-bit; everything else stays."""
-    result = dict(attributes)
-    present = [name for name in (*COLORS, "alpha") if name in result]
-    if all(result[name].dtype == np.uint16 and not (result[name] % 257).any() for name in present):
-        result.update({name: (result[name] // 257).astype(np.uint8) for name in present})
-    return result
+@dataclass
+class Field:
+    """A column of a file that is written: the attribute ``of``, or the ``part``-th of its values, as ``dtype``."""
+
+    name: str
+    of: str
+    dtype: np.dtype
+    shape: tuple[int, ...] = ()
+    part: int | None = None
+    divide: int = 1  # 257: 16-bit colours that are 8-bit ones
+
+    def values(self, cloud: PointCloud) -> np.ndarray:
+        values = cloud.attributes[self.of]
+        if values.ndim > 1:
+            values = values.reshape(len(values), int(np.prod(values.shape[1:])))
+            values = values if self.part is None else values[:, self.part]
+        return (values // self.divide if self.divide > 1 else values).astype(self.dtype)
 
 
-def write_records(file: BinaryIO, cloud: PointCloud, dtype: np.dtype, columns: Mapping[str, np.ndarray]) -> None:
-    """Appends the cloud as packed records of ``dtype``: x, y, z and the columns."""
-    for start in range(0, len(cloud), CHUNK):
-        part = slice(start, start + CHUNK)
-        records = np.empty(len(cloud.points[part]), dtype)
-        for i, axis in enumerate("xyz"):
-            records[axis] = cloud.points[part, i]
-        for name, values in columns.items():
-            records[name] = values[part]
-        file.write(records.tobytes())
+def fields_of(survey: Survey, split: bool, eight_bit: bool = False) -> tuple[list[Field], list[str]]:
+    """Attributes as columns named without spaces, and a warning for each that had to be renamed or left out.
 
-
-class Lines:
-    """The lines of a text file that are not blank, and the number of the last one handed out."""
-
-    def __init__(self, lines: Iterator[str], number: int = 0) -> None:
-        self.lines, self.number, self.last = lines, number, ""
-
-    def __iter__(self) -> Lines:
-        return self
-
-    def __next__(self) -> str:
-        for line in self.lines:
-            self.last, self.number = line, self.number + 1
-            if not line.isspace():
-                return line
-        raise StopIteration
-
-
-def read_table(
-    lines: Lines,
-    dtype: np.dtype,
-    rows: int | None = None,
-    delimiter: str | None = None,
-    comments: str | None = None,
-) -> np.ndarray:
-    """Parses ``rows`` lines of numbers (all, if None) into records of the flat ``dtype``, blank lines left out.
-
-    Raises CloudFileError with the line's number where one does not fit, and where there are too few. The caller has
-    checked that the file is long enough for ``rows``, since numpy allocates them first.
+    split: turns (N, k) ones into k columns; otherwise they stay (N, k). eight_bit: 16-bit colours that are 8-bit ones
+    scaled by 257 (as LAS wants them) become 8-bit.
     """
-    names = dtype.names or ()
-    # Everything as float64 first: writers put 255.0 into integer columns. Only 8-byte integers would lose digits.
-    wide = np.dtype([(n, dtype[n] if dtype[n].kind in "iu" and dtype[n].itemsize == 8 else np.float64) for n in names])
-    if rows == 0:
-        return np.empty(0, dtype)
-    # numpy prints a warning where there is nothing at all to read
-    first = next((line for line in lines if not comments or line.split(comments)[0].strip()), None)
-    if first is None:
-        if rows:
-            raise CloudFileError(f"promises {rows} points and holds none, it is truncated: copy it again")
-        return np.empty(0, dtype)
-    try:
-        table = np.loadtxt(chain([first], lines), wide, comments=comments, delimiter=delimiter, max_rows=rows, ndmin=1)
-    except ValueError:
-        text = lines.last.strip()[:60]
-        raise CloudFileError(f"line {lines.number}: expected {len(names)} numbers, found {text!r}") from None
-    if rows is not None and len(table) < rows:
-        raise CloudFileError(f"promises {rows} points and ends after {len(table)}, it is truncated: copy it again")
-    result = np.empty(len(table), dtype)
-    for name in names:
-        values = table[name]
-        if dtype[name].kind in "iu" and values.dtype.kind == "f":
-            limits = np.iinfo(dtype[name])
-            if not ((values >= limits.min) & (values <= limits.max) & (values == np.rint(values))).all():
-                raise CloudFileError(f"field {name!r} is declared as {dtype[name]} and holds other values")
-        result[name] = values
-    return result
+    fields: list[Field] = []
+    warnings = []
+    colors = [survey.columns[name] for name in (*COLORS, "alpha") if name in survey.columns]
+    halve = eight_bit and all(c.dtype == np.uint16 and c.by_257 for c in colors)
+    for name, column in survey.columns.items():
+        if column.dtype.kind not in "biuf":
+            warnings.append(f"attribute {name!r} is not numeric: left out")
+            continue
+        dtype, divide = column.dtype, 1
+        if halve and name in (*COLORS, "alpha"):
+            dtype, divide = np.dtype(np.uint8), 257
+        width = int(np.prod(column.shape))
+        plain_name = safe_name(name)
+        parts = [plain_name] if not column.shape or not split else [f"{plain_name}_{k}" for k in range(width)]
+        taken = ["x", "y", "z", *(f.name for f in fields)]
+        given = [unique([*taken, part])[-1] for part in parts]
+        for k, free in enumerate(given):
+            whole = not column.shape or not split
+            shape = (width,) if column.shape and not split else ()
+            fields.append(Field(free, name, dtype, shape, None if whole else k, divide))
+        if given != [name]:
+            warnings.append(f"attribute {name!r} is written as {', '.join(given)}")
+    return fields, warnings
+
+
+def safe_name(name: str) -> str:
+    """The name without what would part it in a header, nor a sign that makes it a formula in a spreadsheet."""
+    text = "".join(c if c.isascii() and c.isprintable() and c not in ' ,;#"' else "_" for c in name) or "unnamed"
+    return f"_{text[1:]}" if text[0] in "=+-@" else text
+
+
+def storable(field: Field, column: Column, long_integers: bool) -> str | None:
+    """Gives the field a type that PLY and PCD know, and returns a warning where that rounds its values.
+
+    bool as uint8, half as float; 8-byte integers as double where the format has none (PLY).
+    """
+    kind = field.dtype
+    if kind.kind == "b":
+        field.dtype = np.dtype(np.uint8)
+    elif kind.kind == "f" and kind.itemsize not in (4, 8):
+        field.dtype = np.dtype(np.float32 if kind.itemsize < 4 else np.float64)
+    elif kind.kind in "iu" and kind.itemsize == 8 and not long_integers:
+        field.dtype = np.dtype(np.float64)
+        if max(abs(column.low), abs(column.high)) > 2**53:
+            return f"{field.name} is rounded to double"
+    return None
+
+
+def write_records(file: BinaryIO, stream: CloudStream, dtype: np.dtype, fields: list[Field]) -> None:
+    """Appends the cloud as packed records of ``dtype``: x, y, z and the fields."""
+    for cloud in stream:
+        records = np.empty(len(cloud), dtype)
+        for i, axis in enumerate("xyz"):
+            records[axis] = cloud.points[:, i]
+        for field in fields:
+            records[field.name] = field.values(cloud)
+        file.write(records.tobytes())

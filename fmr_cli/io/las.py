@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import logging
 import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,8 @@ from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io.fields import CHUNK, COLORS, lost_context, unique
+from fmr_cli.io.fields import lost_context, unique
+from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Column, Survey, Wanted
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its errors come as exceptions; no second line on stderr
 
@@ -26,6 +29,9 @@ SMALL, LAZ_LIMIT = 1 << 26, 5000  # bytes nobody minds to allocate; and LAZ does
 PROJECTED, GEOGRAPHIC, USER_DEFINED = 3072, 2048, 32767  # GeoTIFF keys, and their value for "not in EPSG"
 # Compressed layers of LAZ 1.4 by the item's type: point, RGB, RGB + NIR, wave packet; of extra bytes one each (14)
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+POINTWISE, CHUNKED, LAYERED = 1, 2, 3  # LASzip's compressors; the first, of before 2011, is unknown to lazrs
+# Marks the extra bytes in which `write` puts an intensity that the 16 bits of LAS's own do not hold
+INTENSITY = ("Intensity", "not in 16 bits")
 XYZ = laspy.DecompressionSelection.xy_returns_channel().decompress_z()
 
 
@@ -41,49 +47,43 @@ class ClippedFile(io.BufferedReader):
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
-def read(path: Path, attributes: bool) -> PointCloud:
-    """All points, a chunk at a time, so that a file of any size needs little more memory than its cloud."""
+def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
     check_header(path)
-    selection = laspy.DecompressionSelection.all() if attributes else XYZ
+    selection = laspy.DecompressionSelection.all() if wanted.attributes else XYZ
     try:
         with ClippedFile(path) as file, laspy.open(file, decompression_selection=selection, closefd=False) as reader:
             header = reader.header
             if header.are_points_compressed and header.point_count:
                 check_layers(file, header)
+            if header.point_count == 0:
+                raise CloudFileError("holds no points (its header says 0), check how it was written")
             dimensions = header.point_format.dimensions
             # Extra bytes may be called as another dimension is; numpy and laspy tell them apart by name only.
             for k, name in enumerate(unique([d.name for d in dimensions])):
                 dimensions[k] = dimensions[k]._replace(name=name)
-            names = [d.name for d in dimensions if d.name not in "XYZ"] if attributes else []
-            points = np.empty((header.point_count, 3))
-            kept: dict[str, np.ndarray] = {}
+            names = [d.name for d in dimensions if d.name not in "XYZ"] if wanted.attributes else []
+            left_out = ["waveform packets"] if header.global_encoding.waveform_data_packets_internal else []
+            if names and garbled_waveforms(path, header):
+                names = [name for name in names if name not in WAVEFORM_FIELDS_NAMES]
+                left_out.append("waveform fields (lazrs garbles them where there are several scanner channels)")
+            own_intensity = any((d.name, d.description) == INTENSITY for d in header.point_format.extra_dimensions)
+            crs = crs_of(header)
             done = 0
             for chunk in reader.chunk_iterator(CHUNK):
-                part = slice(done, done + len(chunk))
+                points = np.empty((len(chunk), 3))
                 for i, axis in enumerate("XYZ"):
-                    points[part, i] = chunk[axis] * header.scales[i] + header.offsets[i]
-                for name in names:
-                    values = np.asarray(chunk[name])
-                    if done == 0:
-                        kept[name] = np.empty((len(points), *values.shape[1:]), values.dtype)
-                    kept[name][part] = values
+                    points[:, i] = chunk[axis] * header.scales[i] + header.offsets[i]
+                kept = {name: np.array(chunk[name]) for name in names}
+                if own_intensity and names:
+                    kept["intensity"] = kept.pop("Intensity")
                 done += len(chunk)
-            if done != len(points):
-                raise CloudFileError(f"promises {len(points)} points and holds {done}: copy it again")
+                yield PointCloud(points, kept, crs=crs, las_header=header, left_out=tuple(left_out))
+            if done != header.point_count:
+                raise CloudFileError(f"promises {header.point_count} points and holds {done}: copy it again")
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # what lazrs raises on some damaged files is no Exception
             raise
         raise CloudFileError("has damaged compressed data: copy it again") from error
-    if len(points) == 0:
-        raise CloudFileError("holds no points (its header says 0), check how it was written")
-    # What `write` could not put into the 16 bits of LAS's own intensity
-    if "Intensity" in kept and not kept["intensity"].any() and kept["Intensity"].ndim == 1:
-        kept["intensity"] = kept.pop("Intensity")
-    left_out = ["waveform packets"] if header.global_encoding.waveform_data_packets_internal else []
-    if header.are_points_compressed and garbled_waveforms(header, kept):
-        kept = {name: values for name, values in kept.items() if name not in WAVEFORM_FIELDS_NAMES}
-        left_out.append("waveform fields (lazrs garbles them where there are several scanner channels)")
-    return PointCloud(points, kept, crs=crs_of(header), las_header=header, left_out=tuple(left_out))
 
 
 def check_header(path: Path) -> None:
@@ -107,7 +107,28 @@ def check_header(path: Path) -> None:
                 holds = (size - start) // max(point_size, 1)
                 raise CloudFileError(f"promises {count} points and holds {holds}, it is truncated: copy it again")
         elif count:
+            check_compressor(file, header_size, vlrs)
             check_chunks(file, size, start, count, point_size)
+
+
+def check_compressor(file: io.BufferedReader, header_size: int, vlrs: int) -> None:
+    """LAZ: raises CloudFileError where the points were compressed by another than LASzip's chunked compressors."""
+    file.seek(header_size)
+    for _ in range(vlrs):
+        head = file.read(54)
+        if len(head) < 54:
+            return
+        length = int.from_bytes(head[20:22], "little")
+        body = file.read(length)
+        if head[2:16] == b"laszip encoded" and len(body) >= 2:
+            compressor = int.from_bytes(body[:2], "little")
+            if compressor == POINTWISE:
+                raise CloudFileError(
+                    "was compressed by a LASzip of before 2011 (point by point), which is not supported: "
+                    "rewrite it with `laszip` or `las2las`, in or out of compression"
+                )
+            if compressor not in (CHUNKED, LAYERED):
+                raise CloudFileError(f"is compressed in a way that is not known (LASzip's number {compressor})")
 
 
 def check_chunks(file: io.BufferedReader, size: int, start: int, count: int, point_size: int) -> None:
@@ -154,10 +175,13 @@ def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
     file.seek(header.offset_to_point_data)
 
 
-def garbled_waveforms(header: laspy.LasHeader, columns: dict[str, np.ndarray]) -> bool:
+def garbled_waveforms(path: Path, header: laspy.LasHeader) -> bool:
     """lazrs (0.8) mixes up the wave packet fields of point formats 9 and 10 between the scanner's channels."""
-    channels = columns.get("scanner_channel")
-    return header.point_format.id in (9, 10) and channels is not None and bool((channels != channels[0]).any())
+    if header.point_format.id not in (9, 10) or not header.are_points_compressed:
+        return False
+    with laspy.open(path, decompression_selection=XYZ) as reader:
+        channels = {int(c) for chunk in reader.chunk_iterator(CHUNK) for c in np.unique(chunk["scanner_channel"])}
+    return len(channels) > 1
 
 
 def crs_of(header: laspy.LasHeader) -> str | None:
@@ -175,34 +199,62 @@ def crs_of(header: laspy.LasHeader) -> str | None:
     return None
 
 
-def write(path: Path, cloud: PointCloud) -> list[str]:
+@dataclass
+class Placed:
+    """Where an attribute goes: a dimension of the file, after a factor."""
+
+    name: str
+    of: str
+    dtype: np.dtype
+    part: int | None = None  # of an (N, k) attribute, one column
+    factor: int = 1
+
+    def values(self, cloud: PointCloud) -> np.ndarray:
+        values = cloud.attributes[self.of]
+        if values.ndim > 1:
+            values = values.reshape(len(values), -1)
+            values = values[:, self.part] if self.part is not None else values
+        return (
+            values.astype(self.dtype) * self.dtype.type(self.factor) if self.factor != 1 else values.astype(self.dtype)
+        )
+
+
+def write(path: Path, stream: CloudStream) -> list[str]:
     """LAS or LAZ by the suffix; keeps the cloud's LAS header where it has one, else makes a 1.4 header."""
-    header, warnings = header_for(cloud)
-    columns = place_attributes(header, cloud, warnings)
+    survey = stream.survey
+    header, warnings = header_for(survey)
+    placed = place_attributes(header, survey, warnings)
     compress = path.suffix.lower() == ".laz"
-    if compress and garbled_waveforms(header, columns) and "wavepacket_index" in columns:
-        columns = {name: values for name, values in columns.items() if name not in WAVEFORM_FIELDS_NAMES}
-        warnings.append("the waveform fields are left out, LAZ does not keep them for several channels: write .las")
-    header.scales, header.offsets = scaling(cloud, warnings)
+    channels = survey.columns.get("scanner_channel")
+    if compress and header.point_format.id in (9, 10) and channels is not None and channels.low != channels.high:
+        waves = [p for p in placed if p.name in WAVEFORM_FIELDS_NAMES]
+        placed = [p for p in placed if p not in waves]
+        if waves:
+            warnings.append("the waveform fields are left out, LAZ does not keep them for several channels: write .las")
+    header.scales, header.offsets = scaling(survey, warnings)
+    new_returns = survey.head.las_header is None and not {"return_number", "number_of_returns"} & {
+        p.name for p in placed
+    }
     with laspy.open(path, "w", header=header, do_compress=compress) as writer:
-        for start in range(0, len(cloud), CHUNK):
-            part = slice(start, start + CHUNK)
-            points = cloud.points[part]
-            record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
-            counts = np.rint((points - header.offsets) / header.scales)
+        for cloud in stream:
+            record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
+            counts = np.rint((cloud.points - header.offsets) / header.scales)
             for i, axis in enumerate("XYZ"):
                 record[axis] = counts[:, i].astype(np.int32)
-            for name, values in columns.items():
-                record[name][:] = values[part]
+            for field in placed:
+                record[field.name][:] = field.values(cloud)
+            if new_returns:
+                record["return_number"][:] = record["number_of_returns"][:] = 1
             writer.write_points(record)
         if header.evlrs and header.version.minor >= 4:
             writer.write_evlrs(header.evlrs)
-    return warnings + [w for w in lost_context(cloud, path.suffix) if "sensor" in w]
+    return warnings + [w for w in lost_context(survey.head, path.suffix) if "sensor" in w]
 
 
-def header_for(cloud: PointCloud) -> tuple[laspy.LasHeader, list[str]]:
+def header_for(survey: Survey) -> tuple[laspy.LasHeader, list[str]]:
     """A header of our own: a copy of the file's, or a new one with what the cloud needs."""
     warnings = []
+    cloud = survey.head
     if cloud.las_header is None:
         header = laspy.LasHeader(version="1.4", point_format=6)
         header.generating_software = "fmr"
@@ -221,7 +273,7 @@ def header_for(cloud: PointCloud) -> tuple[laspy.LasHeader, list[str]]:
         if cloud.crs:
             header.vlrs.append(crs_record(cloud.crs))
         header.global_encoding.wkt = bool(cloud.crs) and not str(cloud.crs).startswith("EPSG:")
-    colors = [cloud.attributes.get(color) for color in COLORS]
+    colors = [survey.columns.get(color) for color in COLORS]
     if header.point_format.id in WITH_COLORS and all(c is not None and fits(c, 0, 65535) for c in colors):
         old = header.point_format
         new = laspy.PointFormat(WITH_COLORS[old.id])
@@ -240,88 +292,88 @@ def crs_record(crs: str) -> Any:
     return laspy.VLR("LASF_Projection", 34735, "GeoTiff GeoKeyDirectoryTag", keys)
 
 
-def place_attributes(header: laspy.LasHeader, cloud: PointCloud, warnings: list[str]) -> dict[str, np.ndarray]:
+def place_attributes(header: laspy.LasHeader, survey: Survey, warnings: list[str]) -> list[Placed]:
     """Finds each attribute a dimension: LAS's own where it holds the values exactly, else extra bytes of their type."""
     own = {d.name: d for d in header.point_format.standard_dimensions if d.name not in "XYZ"}
     declared = {d.name: d for d in header.point_format.extra_dimensions}
-    columns: dict[str, np.ndarray] = {}
-    extra: dict[str, np.ndarray] = {}
-    for name, values in split(cloud.attributes, warnings).items():
-        if name in COLORS and name in own and values.dtype == np.uint8:
-            columns[name] = values.astype(np.uint16) * 257  # LAS asks for colours that fill 16 bits
-        elif name == "intensity" and "Intensity" in declared and "Intensity" not in cloud.attributes:
-            extra["Intensity"] = values
-        elif name in own and fits(values, own[name].min, own[name].max, own[name].kind.letter() == "f"):
-            columns[name] = values
+    placed: list[Placed] = []
+    extra: dict[str, tuple[Placed, Column]] = {}
+    for name, (field, column) in split(survey, warnings).items():
+        if name in COLORS and name in own and column.dtype == np.uint8:
+            placed.append(Placed(name, field.of, np.dtype(np.uint16), factor=257))  # LAS: colours that fill 16 bits
+        elif name in own and fits(column, own[name].min, own[name].max, own[name].kind.letter() == "f"):
+            placed.append(field)
         else:
-            extra[name.capitalize() if name in own else name] = values
-    if cloud.las_header is None and "return_number" not in columns and "number_of_returns" not in columns:
-        columns |= {name: np.ones(len(cloud), np.uint8) for name in ("return_number", "number_of_returns")}
-    stale = [n for n, d in declared.items() if n not in extra or not (d.is_scaled or same_type(d, extra[n]))]
+            extra[name.capitalize() if name in own else name] = (field, column)
+    stale = [n for n, d in declared.items() if n not in extra or not (d.is_scaled or same_type(d, extra[n][1]))]
     header.remove_extra_dims(stale)
     taken = [d.name for d in header.point_format.dimensions]
-    for name, values in extra.items():
+    for name, (field, column) in extra.items():
         if name in taken and name in declared and name not in stale:
-            columns[name] = values
+            placed.append(Placed(name, field.of, field.dtype, field.part))
             continue
         short = unique([*taken, name.encode()[:30].decode(errors="ignore")])[-1]
         if short != name.capitalize() and short != name:
             warnings.append(f"attribute {name!r} is written as {short!r}, LAS names have at most 32 bytes")
-        kind = values.dtype.newbyteorder("<").str[1:]
-        header.add_extra_dim(laspy.ExtraBytesParams(short, f"{values.shape[1]}{kind}" if values.ndim == 2 else kind))
+        kind = field.dtype.newbyteorder("<").str[1:]
+        width = int(np.prod(column.shape)) if column.shape else 0
+        description = INTENSITY[1] if name == INTENSITY[0] and field.of == "intensity" else ""
+        header.add_extra_dim(laspy.ExtraBytesParams(short, f"{width}{kind}" if width else kind, description))
         taken.append(short)
-        columns[short] = values
-    return columns
+        placed.append(Placed(short, field.of, field.dtype, field.part))
+    return placed
 
 
-def split(attributes: dict[str, np.ndarray], warnings: list[str]) -> dict[str, np.ndarray]:
+def split(survey: Survey, warnings: list[str]) -> dict[str, tuple[Placed, Column]]:
     """Attributes in types that LAS knows; (N, k) ones with k > 3 become k of their own.
 
     Up to 7 single bytes may stay together; laspy does not read back the declaration of more.
     """
-    result: dict[str, np.ndarray] = {}
-    for name, values in attributes.items():
-        if values.dtype.kind not in "biuf":
+    result: dict[str, tuple[Placed, Column]] = {}
+    for name, column in survey.columns.items():
+        dtype = column.dtype
+        if dtype.kind not in "biuf":
             warnings.append(f"attribute {name!r} is not numeric: left out")
             continue
-        if values.dtype.kind == "b":
-            values = values.astype(np.uint8)
-        elif values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
-            values = values.astype(np.float32 if values.dtype.itemsize < 4 else np.float64)
-        if values.ndim > 1:
-            values = values.reshape(len(values), int(np.prod(values.shape[1:])))
-            if values.shape[1] == 1:
-                values = values[:, 0]
-            elif values.shape[1] > (7 if values.dtype == np.uint8 else 3):
-                result |= {f"{name}_{k}": values[:, k] for k in range(values.shape[1])}
-                warnings.append(f"attribute {name!r} is written as {name}_0 to {name}_{values.shape[1] - 1}")
-                continue
-        result[name] = values
+        if dtype.kind == "b":
+            dtype = np.dtype(np.uint8)
+        elif dtype.kind == "f" and dtype.itemsize not in (4, 8):
+            dtype = np.dtype(np.float32 if dtype.itemsize < 4 else np.float64)
+        width = int(np.prod(column.shape))
+        if column.shape and width > 1 and width > (7 if dtype == np.uint8 else 3):
+            single = replace(column, dtype=dtype, shape=())
+            result |= {f"{name}_{k}": (Placed(f"{name}_{k}", name, dtype, k), single) for k in range(width)}
+            warnings.append(f"attribute {name!r} is written as {name}_0 to {name}_{width - 1}")
+        else:
+            alone = column.shape and width == 1
+            shape = () if alone or not column.shape else (width,)
+            result[name] = (Placed(name, name, dtype, 0 if alone else None), replace(column, dtype=dtype, shape=shape))
     return result
 
 
-def fits(values: np.ndarray, low: float, high: float, fraction: bool = False) -> bool:
-    """Whether (N,) values are within the limits and, without ``fraction``, integers."""
-    if values.ndim != 1 or values.dtype.kind not in "iuf":
+def fits(column: Column, low: float, high: float, fraction: bool = False) -> bool:
+    """Whether all values are single numbers within the limits and, without ``fraction``, integers."""
+    if column.shape or column.dtype.kind not in "iuf":
         return False
-    return fraction or bool(((values >= low) & (values <= high) & (values == np.rint(values))).all())
+    return fraction or (column.whole and column.low >= low and column.high <= high)
 
 
-def same_type(dimension: Any, values: np.ndarray) -> bool:
+def same_type(dimension: Any, column: Column) -> bool:
     kind = np.dtype(dimension.type_str())
-    return kind.base == values.dtype and kind.shape == values.shape[1:]
+    return kind.base == column.dtype and kind.shape == column.shape
 
 
-def scaling(cloud: PointCloud, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
+def scaling(survey: Survey, warnings: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Scales and offsets (3,) for which no coordinate leaves int32.
 
     The file's own scales stay unless the extent is too large for them, its offsets unless a point is too far away.
     Without a LAS header the scale is the power of ten that cuts the extent into 10⁸ to 10⁹ steps.
     """
-    low, high = cloud.points.min(0), cloud.points.max(0)
-    if np.abs(cloud.points).max() > 1e100:
+    cloud, low, high = survey.head, survey.low, survey.high
+    farthest = float(np.abs([low, high]).max())
+    if farthest > 1e100:
         raise CloudFileError("coordinates beyond 1e100 do not fit into LAS, write .ply")
-    extent = max(float((high - low).max()), float(np.abs(cloud.points).max()) * 1e-9, 1e-100)
+    extent = max(float((high - low).max()), farthest * 1e-9, 1e-100)
     own = cloud.las_header is not None and bool((cloud.las_header.scales > 0).all())
     if not own or not np.isfinite([cloud.las_header.scales, cloud.las_header.offsets]).all():
         scales = np.full(3, 10.0 ** (np.floor(np.log10(extent)) - 8))

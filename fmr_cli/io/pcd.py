@@ -1,11 +1,14 @@
-"""PCD 0.7: ascii, binary and binary_compressed. Packed `rgb` becomes red, green, blue; VIEWPOINT the sensor's place."""
+"""PCD: ascii, binary and binary_compressed, of every version. Packed `rgb` becomes red, green, blue; VIEWPOINT the
+sensor's place. A compressed file is one block, which has to be in memory whole."""
 
 from __future__ import annotations
 
 import os
 import re
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,19 +16,12 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io.fields import (
-    COLORS,
-    Lines,
-    eight_bit_colors,
-    flat_columns,
-    read_table,
-    storable,
-    to_cloud,
-    unique,
-    write_records,
-)
+from fmr_cli.io.fields import Field, fields_of, storable, to_cloud, unique
+from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
+from fmr_cli.io.table import Lines, read_rows
 
 LONGEST_HEADER = 1 << 20
+LINE_END = re.compile(rb"\r\n|\n|\r")
 PCL_NAMES = {f"n{axis}": f"normal_{axis}" for axis in "xyz"}
 RESTS = ("x_rest", "y_rest", "z_rest")
 NOTABLE = 1e-5  # a rounding that is worth a warning, as a share of the cloud's extent
@@ -42,7 +38,7 @@ class Header:
     crs: str | None
 
 
-def read(path: Path, attributes: bool) -> PointCloud:
+def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
     with path.open("rb") as file:
         header = read_header(file)
         left = os.path.getsize(path) - file.tell()
@@ -59,12 +55,28 @@ def read(path: Path, attributes: bool) -> PointCloud:
                 f"its header promises {header.points} points and the file is too short for them, "
                 "it is truncated or damaged: copy it again"
             )
-        if header.encoding == "ascii":
-            records = read_text(file, header)
-        elif header.encoding == "binary":
-            records = np.fromfile(file, header.fields, header.points)
-        else:
-            records = read_compressed(file, header)
+        for records in records_of(file, header):
+            yield cloud_of(records, header, wanted.attributes)
+
+
+def records_of(file: BinaryIO, header: Header) -> Iterator[np.ndarray]:
+    """The points as records of ``header.fields``, some at a time; at least one, which may be empty."""
+    if header.points == 0:
+        yield np.empty(0, header.fields)
+    elif header.encoding == "ascii":
+        with TextIOWrapper(file, "utf-8", errors="replace") as text:
+            for rows in read_rows(Lines(text, header.lines), np.dtype(flat_names(header.fields)), header.points):
+                yield np.frombuffer(rows.tobytes(), header.fields, len(rows))
+    elif header.encoding == "binary":
+        for start in range(0, header.points, CHUNK):
+            yield np.fromfile(file, header.fields, min(CHUNK, header.points - start))
+    else:
+        records = read_compressed(file, header)
+        for start in range(0, header.points, CHUNK):
+            yield records[start : start + CHUNK]
+
+
+def cloud_of(records: np.ndarray, header: Header, attributes: bool) -> PointCloud:
     columns = {name: records[name] for name in header.fields.names or () if not re.fullmatch(r"_(_\d+)?", name)}
     if {*"xyz", *RESTS} <= set(columns):
         columns |= {axis: columns[axis] + columns.pop(rest) for axis, rest in zip("xyz", RESTS, strict=True)}
@@ -78,33 +90,40 @@ def read(path: Path, attributes: bool) -> PointCloud:
 
 
 def read_header(file: BinaryIO) -> Header:
+    """Keys in capitals or not, each with its values; COLUMNS for FIELDS, and no SIZE and TYPE, as before version 0.6.
+
+    Lines end in LF, CR LF or CR; their words are parted by blanks, tabs or commas.
+    """
+    start = file.read(LONGEST_HEADER)
     words: dict[str, list[str]] = {}
     crs = None
-    number = 0
+    number = place = 0
     while "DATA" not in words:
-        raw = file.readline(LONGEST_HEADER)
-        number += 1
-        if not raw.endswith(b"\n") or file.tell() > LONGEST_HEADER:
+        end = LINE_END.search(start, place)
+        if end is None:
             raise CloudFileError("has no complete PCD header, it is truncated or no PCD file")
-        line = raw.decode("utf-8", errors="replace").strip()
+        line = start[place : end.start()].decode("utf-8", errors="replace").strip()
+        place, number = end.end(), number + 1
         if line.startswith("# crs "):
             crs = line[6:]
         elif line and not line.startswith("#"):
-            key, *values = line.split()
-            words[key] = values
+            key, *values = line.replace(",", " ").split()
+            words[key.upper()] = values
+    file.seek(place)
     try:
-        names = words["FIELDS"]
-        sizes, kinds = words["SIZE"], words["TYPE"]
+        names = words.get("FIELDS") or words["COLUMNS"]
+        sizes, kinds = words.get("SIZE", ["4"] * len(names)), words.get("TYPE", ["F"] * len(names))
         counts = [int(c) for c in words.get("COUNT", ["1"] * len(names))]
-        if not len(names) == len(sizes) == len(kinds) == len(counts) or min(counts) < 1 or max(counts) > 1 << 20:
+        if not len(names) == len(sizes) == len(kinds) == len(counts) or min(counts) < 0 or max(counts) > 1 << 20:
             raise ValueError
-        if any(
-            kind + size not in ("F4", "F8", *(k + s for k in "IU" for s in "1248"))
-            for kind, size in zip(kinds, sizes, strict=True)
-        ):
+        types = [f"{kind.lower()}{size}" for kind, size in zip(kinds, sizes, strict=True)]
+        if any(kind not in ("f4", "f8", *(k + s for k in "iu" for s in "1248")) for kind in types):
             raise ValueError
-        types = [f"<{kind.lower()}{size}" for kind, size in zip(kinds, sizes, strict=True)]
-        layout = [(n, t) if c == 1 else (n, t, (c,)) for n, t, c in zip(unique(names), types, counts, strict=True)]
+        # COUNT 0 takes no place in the records: such a field has no values
+        layout = [
+            (n, f"<{t}") if c == 1 else (n, f"<{t}", (c,))
+            for n, t, c in zip(unique(names), types, counts, strict=True) if c
+        ]  # fmt: skip
         size = [int(words[key][0]) for key in ("WIDTH", "HEIGHT")] if "WIDTH" in words else [int(words["POINTS"][0]), 1]
         points = int(words["POINTS"][0]) if "POINTS" in words else size[0] * size[1]
         viewpoint = tuple(float(v) for v in words.get("VIEWPOINT", []))
@@ -122,12 +141,6 @@ def flat_names(fields: np.dtype) -> list[tuple[str, np.dtype]]:
         for name in fields.names or ()
         for k in range(int(np.prod(fields[name].shape, dtype=int)))
     ]
-
-
-def read_text(file: BinaryIO, header: Header) -> np.ndarray:
-    lines = Lines((line.decode("utf-8", errors="replace") for line in file), header.lines)
-    flat = read_table(lines, np.dtype(flat_names(header.fields)), header.points)
-    return np.frombuffer(flat.tobytes(), header.fields, len(flat))
 
 
 def read_compressed(file: BinaryIO, header: Header) -> np.ndarray:
@@ -168,54 +181,67 @@ def unpack_colors(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return result
 
 
-def write(path: Path, cloud: PointCloud) -> list[str]:
+def write(path: Path, stream: CloudStream) -> list[str]:
     """DATA binary; 8-bit colours packed, everything else in its own type.
 
     PCL and Open3D know float32 coordinates only (Open3D takes F 8 for zeros), so x y z are F 4; where that rounds them,
     what is missing stands in the fields x_rest y_rest z_rest, and `read` adds it again.
     """
-    columns, warnings = flat_columns(pack_colors(eight_bit_colors(cloud.attributes)), split=False)
-    columns = {name: storable(values, long_integers=True) for name, values in columns.items()}
-    with np.errstate(over="ignore", invalid="ignore"):
-        rest = cloud.points - cloud.points.astype(np.float32)
-    coordinate = "<f4" if np.isfinite(rest).all() else "<f8"
-    if coordinate == "<f4" and rest.any():
-        columns |= {name: rest[:, i] for i, name in enumerate(RESTS)}
-        if np.abs(rest).max() > NOTABLE * np.ptp(cloud.points, axis=0).max():
-            error = np.abs(rest).max()
-            warnings.append(f"most readers of PCD take float32 only and will round coordinates by up to {error:.2g}")
-    counts = {name: values[0].size for name, values in columns.items()}
-    dtype = np.dtype(
-        [(axis, coordinate) for axis in "xyz"] + [(n, "<" + v.dtype.str[1:], v.shape[1:]) for n, v in columns.items()]
-    )
-    names = dtype.names or ()
-    types = [dtype[name].base for name in names]
-    header = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7"]
-    if cloud.crs:
-        header.append(f"# crs {' '.join(cloud.crs.splitlines())}")
-    header += [
-        "FIELDS " + " ".join(PCL_NAMES.get(name, name) for name in names),
-        "SIZE " + " ".join(str(t.itemsize) for t in types),
-        "TYPE " + " ".join(t.kind.upper() for t in types),
-        "COUNT " + " ".join(str(counts.get(name, 1)) for name in names),
-        f"WIDTH {len(cloud)}",
-        "HEIGHT 1",
-    ]
-    if cloud.sensor_origin is not None:
-        header.append("VIEWPOINT " + " ".join(repr(float(v)) for v in cloud.sensor_origin) + " 1 0 0 0")
-    header += [f"POINTS {len(cloud)}", "DATA binary\n"]
+    survey = stream.survey
+    fields, warnings = fields_of(survey, split=False, eight_bit=True)
+    packed, fields = pack_colors(fields)
+    for field in fields:
+        storable(field, survey.columns[field.of], long_integers=True)
+    coordinate = "<f4" if np.isfinite(survey.rest) else "<f8"
+    rests = RESTS if coordinate == "<f4" and survey.rest > 0 else ()
+    if rests and survey.rest > NOTABLE * (survey.high - survey.low).max():
+        warnings.append(f"most readers of PCD take float32 only and will round coordinates by up to {survey.rest:.2g}")
+    layout: list[tuple] = [(axis, coordinate) for axis in "xyz"]
+    layout += [(f.name, "<" + f.dtype.str[1:], f.shape) for f in fields]
+    layout += [("rgba", "<u4") if len(packed) == 4 else ("rgb", "<f4")] if packed else []
+    dtype = np.dtype(layout + [(name, "<f8") for name in rests])
     with path.open("wb") as file:
-        file.write("\n".join(header).encode())
-        write_records(file, cloud, dtype, columns)
+        file.write(header_text(survey, dtype).encode())
+        for cloud in stream:
+            records = np.empty(len(cloud), dtype)
+            for i, axis in enumerate("xyz"):
+                records[axis] = cloud.points[:, i]
+                if rests:
+                    records[rests[i]] = cloud.points[:, i] - records[axis]
+            for field in fields:
+                records[field.name] = field.values(cloud)
+            if packed:
+                bits = np.zeros(len(cloud), "<u4")
+                for field, shift in zip(packed, (16, 8, 0, 24), strict=False):
+                    bits |= field.values(cloud).astype("<u4") << shift
+                records["rgba" if len(packed) == 4 else "rgb"] = bits if len(packed) == 4 else bits.view("<f4")
+            file.write(records.tobytes())
     return warnings
 
 
-def pack_colors(attributes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The reverse of unpack_colors, where all channels are 8-bit; other colours stay fields of their own."""
-    channels = [*COLORS, *(["alpha"] if "alpha" in attributes else [])]
-    if not all(c in attributes and attributes[c].dtype == np.uint8 and attributes[c].ndim == 1 for c in channels):
-        return attributes
-    red, green, blue, *alpha = (attributes[c].astype("<u4") for c in channels)
-    bits = red << 16 | green << 8 | blue
-    packed = {"rgba": bits | alpha[0] << 24} if alpha else {"rgb": bits.view("<f4")}
-    return {**{name: v for name, v in attributes.items() if name not in channels}, **packed}
+def header_text(survey: Survey, dtype: np.dtype) -> str:
+    names = dtype.names or ()
+    types = [dtype[name].base for name in names]
+    lines = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7"]
+    if survey.head.crs:
+        lines.append(f"# crs {' '.join(survey.head.crs.splitlines())}")
+    lines += [
+        "FIELDS " + " ".join(PCL_NAMES.get(name, name) for name in names),
+        "SIZE " + " ".join(str(t.itemsize) for t in types),
+        "TYPE " + " ".join(t.kind.upper() for t in types),
+        "COUNT " + " ".join(str(int(np.prod(dtype[name].shape, dtype=int))) for name in names),
+        f"WIDTH {survey.count}",
+        "HEIGHT 1",
+    ]
+    if survey.head.sensor_origin is not None:
+        lines.append("VIEWPOINT " + " ".join(repr(float(v)) for v in survey.head.sensor_origin) + " 1 0 0 0")
+    return "\n".join([*lines, f"POINTS {survey.count}", "DATA binary\n"])
+
+
+def pack_colors(fields: list[Field]) -> tuple[list[Field], list[Field]]:
+    """The fields red, green, blue and alpha that become one, where all are 8-bit, and the others."""
+    by_name = {f.of: f for f in fields}
+    channels = [*COLORS, *(["alpha"] if "alpha" in by_name else [])]
+    if not all(c in by_name and by_name[c].dtype == np.uint8 and not by_name[c].shape for c in channels):
+        return [], fields
+    return [by_name[c] for c in channels], [f for f in fields if f.of not in channels]

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import struct
-from dataclasses import dataclass, field
-from itertools import islice
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from io import TextIOWrapper
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,17 +16,10 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io.fields import (
-    Lines,
-    eight_bit_colors,
-    flat_columns,
-    read_table,
-    storable,
-    to_cloud,
-    unique,
-    write_records,
-)
+from fmr_cli.io.fields import fields_of, storable, to_cloud, unique, write_records
 from fmr_cli.io.mesh import Mesh, fan
+from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted, collect
+from fmr_cli.io.table import Lines, read_rows
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -32,6 +28,7 @@ TYPES = {
 }
 NAMES = {TYPES[name]: name for name in ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")}
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+KEYWORDS = ("ply", "format", "comment", "obj_info", "element", "property", "end_header")
 LONGEST_HEADER = 1 << 20
 
 
@@ -68,82 +65,148 @@ class Header:
     lines: int
 
 
-def read(path: Path, attributes: bool) -> PointCloud | Mesh:
+def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
     """The vertices of a PLY file; a Mesh where it has faces. List properties of vertices are named in ``left_out``."""
-    with path.open("rb") as file:
+    size = os.path.getsize(path)
+    with ExitStack() as stack:
+        file = stack.enter_context(path.open("rb"))
         header = read_header(file)
-        found: dict[str, dict[str, Any]] = {}
-        left_out = []
-        size = os.path.getsize(path)
-        decoded = (line.decode("utf-8", errors="replace") for line in file)
-        text = None if header.order else Lines(decoded, header.lines)
+        names = [e.name for e in header.elements]
+        if "vertex" not in names:
+            raise CloudFileError("has no element 'vertex', so no points")
+        faces = next((e for e in header.elements if e.name == "face" and e.count), None)
+        context = context_of(header)
+        text = None
+        if not header.order:
+            text = Lines(stack.enter_context(TextIOWrapper(file, "utf-8", errors="replace")), header.lines)
+        if text is None and faces is not None and names.index("face") < names.index("vertex"):
+            raise CloudFileError("has its faces before its vertices, write it again in the usual order")
+        corners = None
+        vertices: list[PointCloud] = []
         for element in header.elements:
-            left = size + 1 if text else size - file.tell()  # the last line of a text may lack its end
-            if element.count * element.least_row(binary=text is None) > left:
-                raise CloudFileError(
-                    f"its header promises {element.count} of {element.name!r} and the file is too short for them, "
-                    "it is truncated or damaged: copy it again"
-                )
-            if text:
-                found[element.name] = read_text(text, element)
-            elif element.has_lists:
-                found[element.name] = read_lists(file, element, header.order)
+            check_length(element, text is None, size - (0 if text else file.tell()))
+            if element.name == "vertex":
+                for columns in columns_of(file, text, element, header.order):
+                    cloud = to_cloud(columns, wanted.attributes)
+                    cloud = replace(cloud, **context)
+                    if faces is None:
+                        yield cloud
+                    else:
+                        vertices.append(cloud)
+                if faces is None:
+                    return
             else:
-                records = np.fromfile(file, element.dtype(header.order), element.count if element.properties else 0)
-                found[element.name] = {name: records[name] for name in records.dtype.names or ()}
-            if element.name not in ("vertex", "face"):
-                left_out.append(f"element {element.name!r}")
-            if {"vertex", "face"} <= set(found):
-                break
-    if "vertex" not in found:
-        raise CloudFileError("has no element 'vertex', so no points")
-    lists = [p.name for e in header.elements if e.name == "vertex" for p in e.properties if p.count_type]
-    cloud = to_cloud({name: v for name, v in found["vertex"].items() if name not in lists}, attributes)
-    cloud.left_out = (*(f"list property {name!r}" for name in lists), *left_out)
-    cloud.crs = header.comments.get("crs")
-    if "sensor_origin" in header.comments:
-        origin = np.array(header.comments["sensor_origin"].split(), dtype=np.float64)
-        cloud.sensor_origin = origin if origin.shape == (3,) and np.isfinite(origin).all() else None
-    corners = found.get("face", {}).get("vertex_indices", found.get("face", {}).get("vertex_index"))
-    if corners is None or len(corners) == 0:
-        return cloud
-    return Mesh(cloud, fan(corners))
+                columns = join_columns(columns_of(file, text, element, header.order, lists=element.name == "face"))
+                if element.name == "face":
+                    corners = columns.get("vertex_indices", columns.get("vertex_index"))
+                    break
+        mesh = collect(vertices)
+        if corners is None or len(corners) == 0:
+            yield mesh
+        else:
+            colors = {c: columns[c] for c in COLORS if c in columns and not {*COLORS} & {*mesh.attributes}}
+            yield Mesh(mesh, *fan(corners, colors if wanted.attributes else {}))
+
+
+def context_of(header: Header) -> dict[str, Any]:
+    """What the header says of the whole cloud."""
+    vertex = next(e for e in header.elements if e.name == "vertex")
+    lists = [f"list property {p.name!r}" for p in vertex.properties if p.count_type]
+    others = [f"element {e.name!r}" for e in header.elements if e.name not in ("vertex", "face")]
+    origin = np.array(header.comments.get("sensor_origin", "nan").split(), dtype=np.float64)
+    return {
+        "left_out": (*lists, *others),
+        "crs": header.comments.get("crs"),
+        "sensor_origin": origin if origin.shape == (3,) and np.isfinite(origin).all() else None,
+    }
+
+
+def check_length(element: Element, binary: bool, left: int) -> None:
+    """Raises CloudFileError where what is left of the file is too short for the element."""
+    if element.count * element.least_row(binary) > left + (not binary):  # the last line of a text may lack its end
+        raise CloudFileError(
+            f"its header promises {element.count} of {element.name!r} and the file is too short for them, "
+            "it is truncated or damaged: copy it again"
+        )
+
+
+def columns_of(
+    file: BinaryIO, text: Lines | None, element: Element, order: str, lists: bool = False
+) -> Iterator[dict[str, Any]]:
+    """An element's properties as columns, some rows at a time; leaves the file at its end. lists: those too."""
+    names = [p.name for p in element.properties if lists or not p.count_type]
+    if not element.properties:
+        yield {}
+    elif element.has_lists:
+        columns = read_text_lists(text, element) if text else read_lists(file, element, order)
+        yield {name: columns[name] for name in names}
+    elif text:
+        for records in chain([np.empty(0, element.dtype(""))], read_rows(text, element.dtype(""), element.count)):
+            yield {name: records[name] for name in names}
+    else:
+        for start in range(0, max(element.count, 1), CHUNK):
+            records = np.fromfile(file, element.dtype(order), min(CHUNK, element.count - start))
+            yield {name: records[name] for name in names}
+
+
+def join_columns(parts: Iterator[dict[str, Any]]) -> dict[str, Any]:
+    first, *rest = parts
+    return first if not rest else {name: np.concatenate([first[name], *(p[name] for p in rest)]) for name in first}
+
+
+def header_lines(file: BinaryIO) -> Iterator[str]:
+    """The lines of a header, whichever end they have: LF, CR LF or CR. Leaves the file after the last one taken."""
+    file.seek(0)
+    start = file.read(LONGEST_HEADER)
+    end = min((at for at in (start.find(b"\n"), start.find(b"\r")) if at >= 0), default=-1)
+    if end < 0:
+        raise CloudFileError("has a header without an end, it is truncated: copy it again")
+    stop = b"\n" if start[end : end + 1] == b"\n" else b"\r\n" if start[end : end + 2] == b"\r\n" else b"\r"
+    place = 0
+    while (found := start.find(stop, place)) >= 0:
+        file.seek(found + len(stop))
+        yield start[place:found].decode("utf-8", errors="replace").strip()
+        place = found + len(stop)
+    raise CloudFileError("has a PLY header without an end, it is truncated: copy it again")
 
 
 def read_header(file: BinaryIO) -> Header:
-    if file.readline(10).strip() != b"ply":
+    if file.read(3) != b"ply":
         raise CloudFileError("is not a PLY file (its first line is not 'ply')")
     order = None
     elements: list[Element] = []
     comments: dict[str, str] = {}
-    number = 1
-    while True:
-        raw = file.readline(LONGEST_HEADER)
-        number += 1
-        if not raw.endswith(b"\n") or file.tell() > LONGEST_HEADER:
-            raise CloudFileError("has a PLY header without an end, it is truncated: copy it again")
-        line = raw.decode("utf-8", errors="replace").strip()
+    number = 0
+    in_comment = False
+    for number, line in enumerate(header_lines(file), 1):
         words = line.split()
+        keyword = words[0].lower() if words else ""
         try:
-            match words:
-                case ["end_header"]:
+            match [keyword, *words[1:]]:
+                case ["end_header", *_]:
                     break
+                case ["ply"] | [""]:
+                    continue
                 case ["comment", ("crs" | "sensor_origin") as key, *_]:
                     comments[key] = line.split(maxsplit=2)[2] if len(words) > 2 else ""
-                case [] | ["comment" | "obj_info", *_]:
-                    pass
-                case ["format", kind, _]:
-                    order = ORDERS[kind]
+                case ["comment" | "obj_info", *_]:
+                    in_comment = True
+                    continue
+                case ["format", kind, *_]:
+                    order = ORDERS[kind.lower()]
                 case ["element", name, count] if count.isascii() and count.isdigit():
                     elements.append(Element(name, int(count)))
                 case ["property", "list", count_type, kind, name] if TYPES[count_type][0] in "iu":
                     elements[-1].properties.append(Property(name, TYPES[kind], TYPES[count_type]))
                 case ["property", kind, name]:
                     elements[-1].properties.append(Property(name, TYPES[kind]))
+                case _ if in_comment and keyword not in KEYWORDS:
+                    continue  # a comment of several lines
                 case _:
                     raise ValueError
         except (KeyError, IndexError, ValueError):
             raise CloudFileError(f"has a damaged PLY header: line {number} is {line[:60]!r}") from None
+        in_comment = False
     if order is None:
         raise CloudFileError("has a PLY header without a 'format' line")
     for element in elements:
@@ -152,13 +215,8 @@ def read_header(file: BinaryIO) -> Header:
     return Header(order, elements, comments, number)
 
 
-def read_text(lines: Lines, element: Element) -> dict[str, Any]:
-    """One element of an ascii file, one row a line; lists as tuples."""
-    if not element.has_lists:
-        if not element.properties:
-            return {}
-        records = read_table(lines, element.dtype(""), element.count)
-        return {p.name: records[p.name] for p in element.properties}
+def read_text_lists(lines: Lines, element: Element) -> dict[str, Any]:
+    """One element of an ascii file with lists, one row a line; the lists as tuples."""
     columns: dict[str, list] = {p.name: [] for p in element.properties}
     rows = 0
     for line in islice(lines, element.count):
@@ -238,22 +296,22 @@ def finish(element: Element, columns: dict[str, list]) -> dict[str, Any]:
     }
 
 
-def write(path: Path, cloud: PointCloud) -> list[str]:
+def write(path: Path, stream: CloudStream) -> list[str]:
     """Binary little endian, coordinates as double; what PLY cannot hold comes back as warnings."""
-    columns, warnings = flat_columns(eight_bit_colors(cloud.attributes), split=True)
-    for name, values in columns.items():
-        columns[name] = storable(values, long_integers=False)
-        if values.dtype.kind in "iu" and not (columns[name].astype(values.dtype) == values).all():
-            warnings.append(f"PLY holds no 8-byte integers: {name} is rounded to double")
-    dtype = np.dtype([(axis, "<f8") for axis in "xyz"] + [(name, "<" + v.dtype.str[1:]) for name, v in columns.items()])
+    survey = stream.survey
+    fields, warnings = fields_of(survey, split=True, eight_bit=True)
+    for column in fields:
+        if rounded := storable(column, survey.columns[column.of], long_integers=False):
+            warnings.append(f"PLY holds no 8-byte integers: {rounded}")
+    dtype = np.dtype([(axis, "<f8") for axis in "xyz"] + [(f.name, "<" + f.dtype.str[1:]) for f in fields])
     header = ["ply", "format binary_little_endian 1.0", "comment written by fmr"]
-    if cloud.crs:
-        header.append(f"comment crs {' '.join(cloud.crs.splitlines())}")
-    if cloud.sensor_origin is not None:
-        header.append("comment sensor_origin " + " ".join(repr(float(v)) for v in cloud.sensor_origin))
-    header.append(f"element vertex {len(cloud)}")
+    if survey.head.crs:
+        header.append(f"comment crs {' '.join(survey.head.crs.splitlines())}")
+    if survey.head.sensor_origin is not None:
+        header.append("comment sensor_origin " + " ".join(repr(float(v)) for v in survey.head.sensor_origin))
+    header.append(f"element vertex {survey.count}")
     header += [f"property {NAMES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
     with path.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode())
-        write_records(file, cloud, dtype, columns)
+        write_records(file, stream, dtype, fields)
     return warnings

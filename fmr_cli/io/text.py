@@ -1,8 +1,11 @@
-"""XYZ, TXT and CSV: one point a line, with or without a row of names."""
+"""XYZ, TXT, CSV, ASC and PTS: one point a line, as many programs write it; see `find_dialect` for how it is told."""
 
 from __future__ import annotations
 
 import csv
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -11,69 +14,224 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import (
-    CHUNK,
-    Lines,
     bare_cloud,
-    flat_columns,
+    bare_names,
+    coordinates,
+    fields_of,
     lost_context,
-    narrow_colors,
-    read_table,
+    refuse_degrees,
     to_cloud,
-    unified,
     unique,
 )
+from fmr_cli.io.stream import COLORS, CloudStream, Wanted
+from fmr_cli.io.table import COMMENTS, ROWS, THOUSANDS, Dialect, Lines, Rows, number_in, open_text, parse
+
+HEAD = 200  # lines that are looked at to tell how the file is written
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
+PTS = ("intensity", *COLORS)  # what a PTS line may hold after x y z, in that order
+SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
 
-def read(path: Path, attributes: bool) -> PointCloud:
-    """Columns separated by commas, semicolons or blanks. The names may stand behind # or //, as CloudCompare puts them.
+@dataclass
+class Table:
+    """How a file is written. names: of the columns that are used, or none. promised: the count in its first line."""
 
-    Without names they are x y z, then one column of intensity, three of 8-bit colours or unit normals, or intensity
-    and colours; anything else is called column_4 and so on. Numbers are float64, colours integers.
-    """
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
+    dialect: Dialect
+    names: list[str]
+    left_out: tuple[str, ...]
+    promised: int | None
+
+
+def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
+    """Numbers are float64. Columns without names are told by their values (`fields.bare_names`)."""
+    with open_text(path) as file:
         lines = Lines(file)
-        names, delimiter, first = find_header(lines)
-        count = len(names) if names else len(first.split(delimiter))
-        if count < 3:
-            raise CloudFileError(f"line {lines.number}: has {count} columns, a point has at least x y z")
-        if first:
-            lines = Lines(chain([first], file), lines.number - 1)
-        dtype = np.dtype([(name, np.float64) for name in names or [f"column_{k + 1}" for k in range(count)]])
-        table = read_table(lines, dtype, delimiter=delimiter, comments="#")
-    if names:
-        cloud = to_cloud({name: table[name] for name in names}, attributes)
-        cloud.attributes = narrow_colors(cloud.attributes)
-        return cloud
-    return bare_cloud(table.view(np.float64).reshape(len(table), count), attributes)
+        head = lines.take(HEAD)
+        table = find_table(head)
+        names = table.names or [f"column_{k + 1}" for k in range(len(table.dialect.used))]
+        dtype = np.dtype([(name, np.float64) for name in names])
+        bare: list[str] | None = None
+        done = 0
+        rest = iter(lambda: lines.take(ROWS, COMMENTS), None)
+        for rows in chain([head], rest):
+            last = not rows.lines
+            if table.promised is not None:
+                table.promised += sum(counts_between(rows))
+            values = parse(rows, dtype, table.dialect)
+            done += len(values)
+            if table.names:
+                cloud = to_cloud({name: values[name] for name in names}, wanted.attributes)
+            else:
+                matrix = values.view(np.float64).reshape(len(values), len(names))
+                bare = bare_names(matrix[:, 3:]) if bare is None else bare
+                cloud = bare_cloud(matrix, bare, wanted.attributes)
+            cloud.left_out = table.left_out
+            if not last or done == 0:
+                yield cloud
+            if last:
+                break
+    if table.promised is not None and done != table.promised:
+        what = "it is truncated: copy it again" if done < table.promised else "its first line is no count: take it out"
+        raise CloudFileError(f"promises {table.promised} points in its first line and holds {done}, {what}")
 
 
-def find_header(lines: Lines) -> tuple[list[str], str | None, str]:
-    """The names (or none), the delimiter, and the first line of numbers if it has been consumed."""
-    for line in lines:
-        text = line.strip().lstrip("#/").strip()
-        delimiter = next((d for d in ",;" if d in text), None)
-        words = [word.strip().strip('"') for word in text.split(delimiter)]
-        if {"x", "y", "z"} <= set(unified(words).values()):
-            return unique([word or "unnamed" for word in words]), delimiter, ""
-        if not text or line.lstrip().startswith(("#", "//")):
-            continue
-        return [], delimiter, line
-    raise CloudFileError("holds no points")
+def counts_between(rows: Rows) -> Iterator[int]:
+    """Takes the lines out that hold a count alone, as PTS has them between its scans, and hands the counts out."""
+    for i in reversed([i for i, line in enumerate(rows.lines) if len(line) < 20 and line.strip().isdecimal()]):
+        yield int(rows.lines.pop(i))
+        rows.numbers.pop(i)
 
 
-def write(path: Path, cloud: PointCloud) -> list[str]:
-    """CSV with a row of names; XYZ and TXT with one behind # if there is more than x y z. Shortest exact numbers."""
-    columns, warnings = flat_columns(cloud.attributes, split=True)
-    delimiter = "," if path.suffix.lower() == ".csv" else " "
-    names = delimiter.join(["x", "y", "z", *columns])
+def find_table(head: Rows) -> Table:
+    """How the file is written, told by its first lines; leaves those in ``head`` that hold points.
+
+    Names may stand in the first line, or in a comment before the points. Raises CloudFileError where the names tell of
+    other things than x y z, or of degrees, and where a line has fewer than three columns.
+    """
+    comments: list[str] = []
+    while head.lines and head.lines[0].lstrip().startswith(COMMENTS):
+        comments.append(head.lines.pop(0).strip().lstrip("#%/;!").strip())
+        head.numbers.pop(0)
+    for i in reversed([i for i, line in enumerate(head.lines) if line.lstrip().startswith(COMMENTS)]):
+        del head.lines[i], head.numbers[i]
+    promised = None
+    if len(head.lines) > 1 and head.lines[0].strip().isdecimal():
+        promised = int(head.lines.pop(0))
+        head.numbers.pop(0)
+    named: list[str] = []
+    if head.lines and not any(map(is_number, first := names_in(head.lines[0]))):
+        refuse_degrees(first)
+        if not coordinates(first):
+            raise CloudFileError(
+                f"line {head.numbers[0]}: expected numbers, or names of which some are x, y and z "
+                f"(or Easting, Northing, Elevation and the like), found {head.lines[0].strip()[:60]!r}"
+            )
+        named = first
+        del head.lines[0], head.numbers[0]
+    if not head.lines:
+        raise CloudFileError("holds no points")
+    dialect = find_dialect(head)
+    for comment in comments if not named else []:
+        words = names_in(comment)
+        refuse_degrees(words)
+        if coordinates(words) and len(words) <= dialect.columns:
+            named = words
+    if dialect.columns < 3:
+        raise CloudFileError(f"line {head.numbers[0]}: has {dialect.columns} columns, a point has at least x y z")
+    if named and len(named) < dialect.columns:
+        named = [*named, *(f"column_{k + 1}" for k in range(len(named), dialect.columns))]
+    elif len(named) > dialect.columns:
+        surplus = named[dialect.columns :]
+        if any(surplus):
+            raise CloudFileError(
+                f"line {head.numbers[0]}: expected {len(named)} numbers, found {head.lines[0].strip()[:60]!r}"
+            )
+        named = named[: dialect.columns]
+    return use_numbers(head, dialect, unique(name or "unnamed" for name in named), promised)
+
+
+def use_numbers(head: Rows, dialect: Dialect, named: list[str], promised: int | None) -> Table:
+    """Leaves columns of text out, and the points' own numbers where nothing says what the columns are."""
+    cells = [row for row in map(dialect.cells, head.lines) if len(row) == dialect.columns]
+    axes = [named.index(name) for name in coordinates(named) or ()]
+    words = [
+        k for k in range(dialect.columns) if k not in axes and any(is_text(row[k]) for row in cells)
+    ]  # fmt: skip
+    if not named and dialect.columns - len(words) < 3:
+        words = []  # the line that does not fit will be named
+    left_out = [f"text column {named[k]!r}" if named else f"text column {k + 1}" for k in words]
+    used = [k for k in range(dialect.columns) if k not in words]
+    if not named and len(used) > 3 and len(cells) >= SEQUENCE:
+        first = [row[used[0]].strip() for row in cells]
+        if all(text.isdecimal() for text in first) and (np.diff(np.array(first, float)) == 1).all():
+            left_out.append(f"column {used[0] + 1}, the points' numbers")
+            used = used[1:]
+    dialect.used = used
+    return Table(dialect, [named[k] for k in used] if named else [], tuple(left_out), promised)
+
+
+def find_dialect(head: Rows) -> Dialect:
+    """What separates the cells, told by the first lines, whether commas are decimal, and how many columns there are."""
+    lines = head.lines
+    delimiter = next((d for d in ";|" if d in lines[0]), None)
+    if delimiter is None and len({line.rstrip("\n").count("\t") for line in lines}) == 1 and "\t" in lines[0]:
+        delimiter = "\t"
+    quoted = any('"' in line for line in lines)
+    comma = delimiter is not None and any(DECIMAL_COMMA.fullmatch(c.strip(' "')) for c in lines[0].split(delimiter))
+    if delimiter is None and "," in lines[0]:
+        cells = next(csv.reader([lines[0]], skipinitialspace=True))
+        if any(re.search(r"\d\s+[+-]?\d", cell) for cell in cells):
+            comma = all(DECIMAL_COMMA.fullmatch(c) or is_number(c) for c in lines[0].split())
+        if not comma:
+            delimiter = ","
+            if quoted and any("," in c for c in cells):  # "1,5","2,5": decimals; "1,234.5": marks between thousands
+                comma = not any(THOUSANDS.fullmatch(c.strip()) for c in cells)
+    cells = [cell.strip(' "\n') for line in lines for cell in line.split(delimiter)] if comma else []
+    marked = next((c for c in cells if THOUSANDS.fullmatch(c) and re.search(r"[. ]", c)), None)
+    if marked is not None and delimiter != ",":
+        raise CloudFileError(
+            f"{marked!r} has marks between the thousands as well as decimals: export it again without them"
+        )
+    if delimiter == "," and comma:
+        raise CloudFileError("has commas both as decimals and between the columns: export it with semicolons or points")
+    trailing = delimiter is not None and all(line.rstrip().endswith(delimiter) for line in lines)
+    dialect = Dialect(0, [], delimiter, comma, quoted, trailing)
+    widths = [len(dialect.cells(line)) for line in lines]
+    dialect.columns = max(set(widths), key=lambda width: (widths.count(width), width))
+    if trailing and dialect.columns < 3:  # 1,2,3 where the last cells are empty: no trailing delimiter after all
+        dialect.trailing = False
+        dialect.columns = len(dialect.cells(lines[0]))
+    dialect.used = list(range(dialect.columns))
+    return dialect
+
+
+def names_in(line: str) -> list[str]:
+    """The words of a line that may name columns; their units stay, but where blanks separate."""
+    delimiter = next((d for d in ";\t|," if d in line), None)
+    if delimiter is None:
+        line = re.sub(r"\s*[\[(][^\])]*[\])]", "", line)
+        return line.strip().lstrip("#%/;!").split()
+    words = next(csv.reader([line.strip("\n")], delimiter=delimiter, skipinitialspace=True))
+    return [word.strip().lstrip("#%/").strip().strip("'") for word in words]
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell holds a number, whatever its decimals are parted by; a word for a missing one is none."""
+    try:
+        return not np.isnan(number_in(cell.replace(",", ".")))
+    except ValueError:
+        return False
+
+
+def is_text(cell: str) -> bool:
+    """Whether a cell holds neither a number, nor a word for a missing one, nor a number with marks in it."""
+    try:
+        number_in(cell.replace(",", "."))
+    except ValueError:
+        return not THOUSANDS.fullmatch(cell.strip().strip('"'))
+    return False
+
+
+def write(path: Path, stream: CloudStream) -> list[str]:
+    """CSV with a row of names; others with one behind # if there is more than x y z. Shortest exact numbers."""
+    suffix = path.suffix.lower()
+    fields, warnings = fields_of(stream.survey, split=True, eight_bit=suffix == ".pts")
+    delimiter = "," if suffix == ".csv" else " "
+    if suffix == ".pts":
+        fitting = [f for f in fields if f.of in PTS and (f.of == "intensity" or f.dtype == np.uint8)]
+        lost = [f.name for f in fields if f not in fitting]
+        fields = sorted(fitting, key=lambda f: PTS.index(f.of))
+        warnings += [f".pts cannot hold the attributes {', '.join(lost)}: left out"] if lost else []
+    names = delimiter.join(["x", "y", "z", *(f.name for f in fields)])
     with path.open("w", encoding="utf-8", newline="") as file:
-        if delimiter == ",":
+        if suffix == ".pts":
+            file.write(f"{stream.survey.count}\n")
+        elif delimiter == ",":
             file.write(f"{names}\n")
-        elif columns:
+        elif fields:
             file.write(f"# {names}\n")
         rows = csv.writer(file, delimiter=delimiter, lineterminator="\n")
-        for start in range(0, len(cloud), CHUNK // 8):
-            part = slice(start, start + CHUNK // 8)
-            values = [*cloud.points[part].T.tolist(), *(column[part].tolist() for column in columns.values())]
+        for cloud in stream:
+            values = [*cloud.points.T.tolist(), *(f.values(cloud).tolist() for f in fields)]
             rows.writerows(zip(*values, strict=True))
-    return warnings + lost_context(cloud, path.suffix)
+    return warnings + lost_context(stream.survey.head, path.suffix)

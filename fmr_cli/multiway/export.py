@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.batch.one_pair import suffix_for
 from fmr_cli.cloud import PointCloud
 from fmr_cli.geometry.frames import Frame
-from fmr_cli.geometry.voxels import cell_numbers
+from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.io import atomic_write, read_cloud, write_cloud, write_transform
 from fmr_cli.io.outputs import write_json
+from fmr_cli.io.stream import collect
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Network
 from fmr_cli.multiway.pose_graph import adjoint
@@ -112,7 +113,9 @@ def write_aligned(network: Network, out: Path) -> list[str]:
         crs = crs_of(network, members)
         for n in members:
             cloud = moved(network, n, crs)
-            warnings += write_cloud(out / "aligned" / f"{network.scans[n].name}{suffix_for(cloud)}", cloud)
+            warnings += write_cloud(
+                out / "aligned" / f"{network.scans[n].name}{suffix_for(cloud.path) if cloud.path else '.ply'}", cloud
+            )
     return list(dict.fromkeys(warnings))
 
 
@@ -126,9 +129,8 @@ def write_merged(network: Network, path: Path, voxel: float | None) -> list[str]
         crs = crs_of(network, members)
         clouds = [thinned(moved(network, n, crs), voxel) for n in members]
         merged, said = merged_clouds(clouds, "scan_id", members)
-        merged.crs = crs
         name = path if len(network.components) == 1 else path.with_name(f"{path.stem}_{number}{path.suffix}")
-        warnings += said + write_cloud(name, thinned(merged, voxel))
+        warnings += said + write_cloud(name, thinned(collect(merged), voxel) if voxel else merged)
     return list(dict.fromkeys(warnings))
 
 
@@ -157,7 +159,7 @@ def thinned(cloud: PointCloud, voxel: float | None) -> PointCloud:
     """The first point of each voxel, or the cloud as it is."""
     if voxel is None:
         return cloud
-    return cloud.select(np.sort(np.unique(cell_numbers(cloud.points, voxel), return_index=True)[1]))
+    return cloud.select(np.sort(np.unique(voxel_keys(cloud.points, voxel), return_index=True)[1]))
 
 
 def summary(network: Network) -> list[str]:

@@ -21,6 +21,7 @@ from fmr_cli.geometry.sampling import sample
 from fmr_cli.registration.models import bundled_local_encoder, fast_encoder, solver
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.prepared import MIN_POINTS, Prepared, pair_edge
+from fmr_cli.registration.units import unit_hint
 
 KEYPOINTS = 500  # of a cloud
 CONSENSUS_TOLERANCE = 2.0  # voxel edges: how far a keypoint's place may lie off in two samplings of one surface
@@ -52,6 +53,11 @@ class Pair:
         for cloud, surface in ((source, self.s), (target, self.t)):
             if len(surface.points) < MIN_POINTS:
                 what = f"fewer than {MIN_POINTS} voxels of {edge:.3g} hold points; lower --voxel-size"
+                if options.voxel_size is None:
+                    what = unit_hint(source.points, target.points) or (
+                        f"is too small beside the other cloud: fewer than {MIN_POINTS} voxels of {edge:.3g} hold "
+                        "points; are they in one unit?"
+                    )
                 raise RegistrationError(f"{cloud.name}: {what}")
 
     # In the files' coordinates, and in the encoder's unit box.

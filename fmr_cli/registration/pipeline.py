@@ -25,6 +25,7 @@ from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration, Stopwatch, describe
+from fmr_cli.registration.units import unit_hint
 
 REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
@@ -71,6 +72,9 @@ def align(
                 best = replace(best, T_target_source=refinement.exact(judge.pair, T))
         with time.stage("verdict"):
             found = describe(judge.pair, best, judge.candidates[1:], source, factor, options)
+    found.warnings += [*source.notes, *target.notes]
+    if found.status != "aligned" and not options.scale and (hint := unit_hint(source.points, target.points)):
+        found.warnings.append(hint)
     found.seconds = time.seconds
     return found
 

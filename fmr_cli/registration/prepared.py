@@ -26,7 +26,8 @@ class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, within bounds, for its next pair.
 
     points: (N, 3) float64, centred, at most AT_MOST, finite and distinct. frame: the centred coordinates, whose origin
-    is the mean of the cloud. set_aside: how many points are no surface, by why (see ``strays``). edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. Raises
+    is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. notes:
+    what a person should know of it, as how many points are no surface (see ``strays``). Raises
     RegistrationError: fewer than 10 distinct points, all in one place.
     """
 
@@ -35,7 +36,8 @@ class Prepared:
         points = thinned(cloud.points, AT_MOST, rng)
         points = points[np.isfinite(points).all(1)]
         found = strays(points, np.random.default_rng(seed)) if len(points) else Strays(np.ones(0, bool), {})
-        points, self.set_aside = points[found.keep], found.reasons
+        points = points[found.keep]
+        self.notes = [f"{cloud.name}: {n} points {why} are no surface, set aside" for why, n in found.reasons.items()]
         self.frame = Frame(points.mean(0) if len(points) else np.zeros(3))
         points = distinct(self.frame.enter(points))
         if len(points) == 1 and len(cloud) > 1:
@@ -44,7 +46,7 @@ class Prepared:
             raise RegistrationError(
                 f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
             )
-        self.name, self.read, self.seed = cloud.name, len(cloud), seed
+        self.name, self.read, self.seed = cloud.name, cloud.count, seed
         self.points = points
         self.edge, self.spacing = working_scale(self.points, rng)
         self._surfaces, self._described, self._fine, self._gicp = (Memo(KEPT) for _ in range(4))

@@ -21,7 +21,7 @@ def folder(tmp_path):
 def test_it_lets_go_of_what_was_used_longest_ago(folder):
     cache = CloudCache(at_most=250)
     for name in "abac":
-        cache.get(folder / f"{name}.ply", seed=0, attributes=False)
+        cache.get(folder / f"{name}.ply", seed=0)
     assert [key.path.stem for key in cache.files] == ["a", "c"]
 
 
@@ -29,22 +29,20 @@ def test_it_lets_go_of_what_no_pair_needs_any_more(folder):
     cache, a, b = CloudCache(), folder / "a.ply", folder / "b.ply"
     cache.expect([a, b, a, a])
     for path in (a, b):
-        cache.get(path, seed=0, attributes=False)
+        cache.get(path, seed=0)
     cache.done_with(a, b)
     assert [key.path for key in cache.files] == [a]
 
 
-def test_another_seed_or_wanting_the_cloud_itself_is_another_entry(folder):
+def test_another_seed_is_another_entry(folder):
     cache, path = CloudCache(), folder / "a.ply"
-    plain = cache.get(path, seed=0, attributes=False)
-    assert cache.get(path, seed=0, attributes=False) is plain
-    assert cache.get(path, seed=1, attributes=False) is not plain
-    assert plain.cloud is None
-    assert cache.get(path, seed=0, attributes=True).cloud is not None
+    plain = cache.get(path, seed=0)
+    assert cache.get(path, seed=0) is plain
+    assert cache.get(path, seed=1) is not plain
 
 
 def test_a_file_that_cannot_be_read_says_so_each_time(folder):
     cache = CloudCache()
     for _ in range(2):
         with pytest.raises(CloudFileError, match="no such file"):
-            cache.get(folder / "nowhere.ply", seed=0, attributes=False)
+            cache.get(folder / "nowhere.ply", seed=0)

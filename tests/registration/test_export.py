@@ -10,6 +10,7 @@ import pytest
 from fmr_cli import PointCloud, read_cloud, write_cloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.outputs import check_outputs, write_json
+from fmr_cli.io.stream import collect
 from fmr_cli.registration.export import aligned_cloud, merged_cloud
 from fmr_cli.registration.result import plain
 
@@ -31,17 +32,18 @@ def clouds() -> tuple[PointCloud, PointCloud]:
 
 
 def test_residuals_are_exact_far_from_the_origin(clouds):
-    moved = aligned_cloud(*clouds, T)
+    moved = collect(aligned_cloud(*clouds, T))
     np.testing.assert_allclose(moved.attributes["residual"], 0.25, atol=1e-6)
     np.testing.assert_allclose(moved.points, clouds[1].points - [0, 0, 0.25], rtol=0, atol=1e-9)
 
 
 def test_the_moved_source_is_in_the_targets_reference_system(clouds):
-    assert aligned_cloud(*clouds, T).crs == "EPSG:25832"
+    assert collect(aligned_cloud(*clouds, T)).crs == "EPSG:25832"
 
 
 def test_merging_turns_the_sources_normals_and_fills_what_one_lacks(clouds):
-    merged, warnings = merged_cloud(*clouds, T)
+    stream, warnings = merged_cloud(*clouds, T)
+    merged = collect(stream)
     assert merged.attributes["source_id"].tolist() == [0] * 50 + [1] * 50
     np.testing.assert_allclose(merged.attributes["ny"][:50], 1)
     assert not merged.attributes["ny"][50:].any()
@@ -50,7 +52,7 @@ def test_merging_turns_the_sources_normals_and_fills_what_one_lacks(clouds):
 
 
 def test_merging_brings_8_bit_colours_to_16_bits(clouds):
-    red = merged_cloud(*clouds, T)[0].attributes["red"]
+    red = collect(merged_cloud(*clouds, T)[0]).attributes["red"]
     assert red.dtype == np.uint16
     assert red[:50].tolist() == [257 * value for value in range(50)]
     assert set(red[50:]) == {257 * 9}
@@ -58,7 +60,7 @@ def test_merging_brings_8_bit_colours_to_16_bits(clouds):
 
 @pytest.mark.parametrize("suffix", [".las", ".ply", ".pcd", ".csv"])
 def test_a_merged_cloud_comes_back_from_its_file(clouds, tmp_path, suffix):
-    merged, _ = merged_cloud(*clouds, T)
+    merged = collect(merged_cloud(*clouds, T)[0])
     write_cloud(tmp_path / f"merged{suffix}", merged)
     back = read_cloud(tmp_path / f"merged{suffix}")
     np.testing.assert_allclose(back.points, merged.points, rtol=0, atol=1e-6)

@@ -1,0 +1,32 @@
+"""Scans within one file: which there are, and which is meant by FILE#2 or FILE#name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fmr_cli.errors import CloudFileError
+
+
+@dataclass(frozen=True)
+class ScanPart:
+    """One scan of a file. T_file_scan: (4, 4), its own frame to the file's common one. count: of points, also invalid."""
+
+    name: str
+    T_file_scan: np.ndarray
+    count: int
+
+
+def choose(parts: list[ScanPart], wanted: str | None) -> list[int]:
+    """The scans that are meant, by place from 0: all, or the one of that name, or of that number from 1."""
+    if wanted is None:
+        return list(range(len(parts)))
+    named = [k for k, part in enumerate(parts) if part.name == wanted]
+    if len(named) == 1:
+        return named
+    if wanted.isascii() and wanted.isdecimal() and 1 <= int(wanted) <= len(parts):
+        return [int(wanted) - 1]
+    names = ", ".join(part.name for part in parts[:20])
+    what = f"has {len(named)} scans called {wanted!r}, give its number" if named else f"has no scan {wanted!r}"
+    raise CloudFileError(f"{what}; there are {len(parts)}: {names}")
