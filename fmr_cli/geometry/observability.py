@@ -2,25 +2,76 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from fmr_cli.geometry.point_to_plane import point_to_plane
+from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.kernels import geman_mcclure
+from fmr_cli.geometry.point_to_plane import SCALE, linearise, normal_equations
 from fmr_cli.geometry.surface import Surface
+from fmr_cli.geometry.voxels import voxel_keys
 
 WEAK = 2e-3  # of the strongest direction's information: what the noise of the normals alone pretends to
+REACH = 1.5  # voxel edges: correspondences further apart are no observations
+BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated, those of two blocks not
+BENDS = 8.0  # independent parts of a scan that is bent or drifted as a whole: half an extent each
+NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
+LEAST_BLOCKS = 8  # fewer say nothing about the scatter of their sums
 
 
-def information(source: Surface, target: Surface, T: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """The 6x6 information matrix of the pose, order (rotation, translation): rad⁻² and unit⁻².
+@dataclass(frozen=True)
+class Certainty:
+    """How well a pose is determined; twists (rotation, translation), rad and own unit.
 
-    Of a twist in the target's frame about ``origin`` (3,), from point-to-plane at T; the residuals' own variance stands
-    for the noise, and a voxel's points count as one observation.
+    information: (6, 6), as if every voxel were an observation of its own: tells which directions are determined at
+    all. covariance: (6, 6), of the pose, over the directions that are.
     """
-    normal = point_to_plane(
-        source.points, target.points, target.normals, target.tree, T, 1.5 * target.edge, origin
-    )  # fmt: skip
-    floor = (1e-6 * target.edge) ** 2
-    return normal.A[:6, :6] / max(normal.variance, floor)
+
+    information: np.ndarray
+    covariance: np.ndarray
+
+
+def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, origin: np.ndarray) -> Certainty:
+    """Of the twist in the target's frame about ``origin`` (3,), by point-to-plane at a pose, both ways.
+
+    With A = Σ w J Jᵀ and g_b = Σ w J r over block b of neighbouring voxels, the covariance is A⁻¹ (Σ g_b g_bᵀ) A⁻¹ (the
+    sandwich of cluster-robust regression, Liang and Zeger 1986): it holds however the residuals within a block hang
+    together, be it by noise that voxels share or by a surface that is bent. Where the residuals' own optimum lies
+    further from the pose than this covariance allows, it grows to what allows it (Birge's ratio). A misfit beyond the surfaces' own
+    roughness, as of scans that are bent or drifted, is the same over large parts, of which there are BENDS.
+    """
+    A, scores, misfits, sums = np.zeros((6, 6)), [], [], np.zeros(2)
+    back = np.linalg.inv(T_target_source)
+    for a, b, T, swapped in ((source, target, T_target_source, False), (target, source, back, True)):
+        moved = transform_points(T, a.points)
+        distance, match = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
+        here = np.isfinite(distance) & a.solid
+        if not here.any():
+            continue
+        x, y, n = moved[here], b.points[match[here]], b.normals[match[here]]
+        if swapped:  # the target's points on the source's planes, both seen in the target's frame
+            x, y, n = transform_points(T_target_source, y), a.points[here], n @ T_target_source[:3, :3].T
+        r, J = linearise(x, y, n, origin)
+        w = geman_mcclure(r * r, (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * b.edge) ** 2)
+        A += normal_equations(J, r, w)[0]
+        blocks, index = np.unique(voxel_keys(y, BLOCK * b.edge), return_inverse=True)
+        scores.append(np.stack([np.bincount(index, row, len(blocks)) for row in J * (w * r)], 1))
+        sums += [w @ (r * r), w.sum()]
+        misfits.append(NORMAL**2 * (np.median(np.abs(r)) ** 2 - np.median(b.unevenness[0][match[here]]) ** 2))
+    variance = sums[0] / max(sums[1], 1e-12)
+    information = A / 2 / max(variance, (1e-6 * target.edge) ** 2)
+    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-9, hermitian=True) / np.outer(scale, scale)
+    covariance = inverse * sums[1] * max(sum(misfits), 0.0) / 2 / BENDS  # a misfit that no roughness explains
+    g = np.concatenate(scores) if scores else np.zeros((0, 6))
+    if len(g) >= LEAST_BLOCKS:
+        meat = g.T @ g * 2 * len(g) / (len(g) - 6)  # twice: the two ways see the same surfaces
+        sandwich, step = inverse @ meat @ inverse, inverse @ g.sum(0)
+        covariance += sandwich * max(step @ np.linalg.pinv(sandwich, rcond=1e-9, hermitian=True) @ step / 6, 1.0)
+    else:
+        covariance += inverse * max(variance, (1e-6 * target.edge) ** 2)
+    return Certainty(information, covariance)
 
 
 def undetermined(info: np.ndarray, length: float) -> list[str]:

@@ -10,6 +10,7 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.gicp import GicpCloud
 from fmr_cli.geometry.sampling import distinct, sample, thinned, working_scale
+from fmr_cli.geometry.smoothing import roughness
 from fmr_cli.geometry.strays import Strays, strays
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_downsample
@@ -49,7 +50,7 @@ class Prepared:
         self.name, self.read, self.seed = cloud.name, cloud.count, seed
         self.points = points
         self.edge, self.spacing = working_scale(self.points, rng)
-        self._surfaces, self._described, self._fine, self._gicp = (Memo(KEPT) for _ in range(4))
+        self._surfaces, self._described, self._fine, self._gicp, self._roughness = (Memo(KEPT) for _ in range(5))
 
     @property
     def centre(self) -> np.ndarray:
@@ -82,6 +83,10 @@ class Prepared:
             return sample(points, count, np.random.default_rng(self.seed))
 
         return self._fine.get((count, edge), thin)
+
+    def roughness(self, count: int, edge: float) -> float:
+        """Of ``fine``: about 0.05 on clean scans, from 0.1 on the points are noisy (see ``smoothing``)."""
+        return self._roughness.get((count, edge), lambda: roughness(self.fine(count, edge)))
 
     def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> GicpCloud:
         """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""

@@ -12,9 +12,10 @@ from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.inverse_compositional import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.geometry.gicp import GicpCloud, gicp
-from fmr_cli.geometry.point_to_plane import constrained, point_to_plane
+from fmr_cli.geometry.point_to_plane import constrained, point_to_plane, step_motion
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.se3 import exp
+from fmr_cli.geometry.smoothing import local_planes
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.pair import RANKING_POINTS, Pair
@@ -26,6 +27,9 @@ PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, I
 PLANE_REACHES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.7)  # voxel edges, a step each
 DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
+# `python -m benchmarks.noise`: roughness 0.22 at 1 % noise, below 0.08 without; 30 neighbours are best of 10 to 50 there
+ROUGH, SMOOTHED_OVER = 0.12, 30
+SMOOTHED_REACHES = (1.0, 1.0, 0.7, 0.7, 0.5, 0.5)  # voxel edges, a step each
 GICP_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
 EXACT_TARGET = 200_000  # points of the target that the winner is refined against once more, each its own
 FINER = 4.0  # times the grid of the last step on large clouds, where they are dense enough
@@ -94,7 +98,32 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
         s, t = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge)
         return constrained(s, t, T_target_source, pair.edge, pair.motion.basis(), pair.options.scale)
     target = pair.target.for_gicp(GICP_TARGET, pair.edge, pair.threads)
-    return gicp_in_reach(pair, pair.source.fine(GICP_SOURCE, pair.edge), target, T_target_source)
+    T = gicp_in_reach(pair, pair.source.fine(GICP_SOURCE, pair.edge), target, T_target_source)
+    return by_smoothed(pair, T) if noisy(pair) else T
+
+
+def noisy(pair: Pair) -> bool:
+    """Whether the points of a cloud scatter about its surface by more than GICP's small neighbourhoods even out."""
+    clouds = ((pair.source, GICP_SOURCE), (pair.target, GICP_TARGET))
+    return max(cloud.roughness(count, pair.edge) for cloud, count in clouds) > ROUGH
+
+
+def by_smoothed(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+    """The pose after point-to-plane steps between points put onto planes through many neighbours.
+
+    Noise averages out over a neighbourhood; points are put onto planes rather than averaged, so that two samplings of
+    one surface stay on it. On clean scans so wide a plane would cut corners, and GICP is as exact.
+    """
+    source, target = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge)
+    source = local_planes(source, cKDTree(source), SMOOTHED_OVER)[0]
+    target, normals, _ = local_planes(target, cKDTree(target), SMOOTHED_OVER)
+    tree, T = cKDTree(target), T_target_source
+    for reach in SMOOTHED_REACHES:
+        normal = point_to_plane(source, target, normals, tree, T, reach * pair.edge, np.zeros(3))
+        if normal.count < MIN_POINTS:
+            return T_target_source
+        T = step_motion(-np.linalg.lstsq(normal.A[:6, :6], normal.b[:6], rcond=1e-10)[0]) @ T
+    return T
 
 
 def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_source: np.ndarray) -> np.ndarray:

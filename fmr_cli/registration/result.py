@@ -85,7 +85,7 @@ def describe(
     """
     T = pair.leave_centred(best.T_target_source)
     T[:3, :3] *= factor
-    info = observability.information(pair.s, pair.t, best.T_target_source, np.zeros(3))
+    certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3))
     alternatives = [
         {
             "T_target_source": pair.leave_centred(c.T_target_source).tolist(),
@@ -109,10 +109,10 @@ def describe(
         angle=angle_degrees(T),
         shift=float(np.linalg.norm(transform_points(T, source.centre[None])[0] - source.centre)),
         scale=float(np.cbrt(np.linalg.det(T[:3, :3]))),
-        information=info,
-        covariance=np.linalg.pinv(info, rcond=1e-12, hermitian=True),
+        information=np.linalg.pinv(certain.covariance, rcond=1e-12, hermitian=True),
+        covariance=certain.covariance,
         origin=pair.target.centre,
-        undetermined=observability.undetermined(info, pair.boxes[1].unit / 2),
+        undetermined=observability.undetermined(certain.information, pair.boxes[1].unit / 2),
         alternatives=alternatives,
         evidence=asdict(best.evidence),
         voxel_size=pair.edge,

@@ -1,0 +1,35 @@
+"""How noisy a cloud is, told by its own neighbourhoods, and its points put onto the planes that these have in common."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fmr_cli.geometry.normals import smallest_eigenvector
+
+NEAR = 10  # neighbours that tell noise from shape: so few lie on a plane, whatever the surface
+PROBES = 500  # points at which that is looked at
+
+
+def local_planes(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least squares planes through the nearest ``neighbours`` of points (N, 3) among those of a tree.
+
+    Returns the points put onto their planes (N, 3), unit normals (N, 3), and the planes' roughness (N,): the deviation
+    of the neighbours from it, over the distance of the farthest. That is noise over the neighbourhood's size, where
+    there is noise, and small on any smooth surface.
+    """
+    distance, index = tree.query(points, min(neighbours, tree.n))
+    around = tree.data[index]
+    middle = around.mean(1)
+    x, y, z = np.moveaxis(around - middle[:, None], -1, 0)
+    products = [np.einsum("ij,ij->i", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
+    normals, least = smallest_eigenvector(*products)
+    deviation = np.sqrt(np.maximum(least, 0) / max(index.shape[1] - 3, 1))
+    off = np.einsum("ij,ij->i", points - middle, normals)
+    return points - off[:, None] * normals, normals, deviation / np.maximum(distance[:, -1], 1e-300)
+
+
+def roughness(points: np.ndarray) -> float:
+    """The median roughness of small neighbourhoods of points (N, 3), by ``local_planes``: 0.05 is clean, 0.2 noisy."""
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    return float(np.median(local_planes(points[:: max(len(points) // PROBES, 1)], tree, NEAR)[2]))
