@@ -74,15 +74,17 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     return Certainty(information, covariance)
 
 
-def undetermined(info: np.ndarray, length: float) -> list[str]:
+def undetermined(info: np.ndarray, length: float, basis: np.ndarray | None = None) -> list[str]:
     """The directions that the scans hardly determine, in words: those WEAK against the strongest.
 
-    info: (6, 6); length: turns radians into the unit, so that both kinds of motion compare.
+    info: (6, 6); length: turns radians into the unit, so that both kinds of motion compare; basis: (6, d) orthonormal
+    twists that the motion may use, None for all six.
     """
     S = np.diag([1 / length] * 3 + [1.0] * 3)
-    values, vectors = np.linalg.eigh(S @ info @ S)
+    B = np.eye(6) if basis is None else basis
+    values, vectors = np.linalg.eigh(B.T @ S @ info @ S @ B)
     said = []
-    for value, vector in zip(values, vectors.T, strict=True):
+    for value, vector in zip(values, (B @ vectors).T, strict=True):
         if value > WEAK * max(values[-1], 1e-300):
             continue
         omega, v = vector[:3], vector[3:]

@@ -98,7 +98,8 @@ def look(source: Prepared, target: Prepared, options: Options, threads: int, tim
                 consider(judge, features(seen, time), time)
             if judge.sure(SURE):
                 return judge
-    if options.init == "search" or (options.init == "auto" and may_overlap_fully(pair)):
+    likely = bool(judge.candidates) and judge.best.support >= LIKELY
+    if options.init == "search" or (options.init == "auto" and not likely and may_overlap_fully(pair)):
         with time.stage("search"):
             found = hypotheses.from_search(pair)
         consider(judge, found, time)
@@ -139,8 +140,9 @@ def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch) -> None:
             if hypothesis.score >= WORTH * ranked[0].score and not judge.knows(hypothesis.T_target_source):
                 judge_refined(judge, hypothesis)
     with time.stage("rivals"):
-        if judge.sure(LIKELY):
-            rivals, judge.repeats = hypotheses.rivals(pair, judge.best.T_target_source)
+        if judge.candidates and judge.best.support >= LIKELY:
+            rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
+            judge.found_repeats(repeats)
             for hypothesis in rivals:
                 if not judge.knows(hypothesis.T_target_source):
                     judge_refined(judge, hypothesis)

@@ -16,10 +16,13 @@ import scipy
 import fmr_cli
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.geometry import observability
-from fmr_cli.registration.confidence import ALIGNED, Candidate
+from fmr_cli.registration.confidence import ALIGNED, Candidate, doubts
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair
 from fmr_cli.registration.prepared import Prepared
+
+LIKELY = 0.5  # support from which a pose would be called right if it were alone
+RIVALLING = 0.1  # of the best one's confidence, that an alternative has at least
 
 
 @dataclass
@@ -41,7 +44,7 @@ class Registration:
     undetermined: the directions that the scans hardly determine, in words.
     alternatives: other poses that would be called aligned if alone, as of a symmetric shape, best first:
         T_target_source, confidence, feature_error.
-    evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
+    reasons: why the status is not "aligned", in words. evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
     """
 
     T_target_source: np.ndarray
@@ -66,6 +69,7 @@ class Registration:
     points: dict[str, int]
     options: Options
     seconds: dict[str, float] = field(default_factory=dict)
+    reasons: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
@@ -86,19 +90,22 @@ def describe(
     T = pair.leave_centred(best.T_target_source)
     T[:3, :3] *= factor
     certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3))
+    rivals = [c for c in others if c.support >= LIKELY and c.confidence >= RIVALLING * best.confidence]
+    weak = observability.undetermined(certain.information, pair.boxes[1].unit / 2, pair.motion.basis())
+    aligned = best.confidence >= ALIGNED and not weak
+    reasons = [f"the scans do not determine: {'; '.join(weak)}"] if weak else []
     alternatives = [
         {
             "T_target_source": pair.leave_centred(c.T_target_source).tolist(),
             "confidence": c.confidence,
             "feature_error": pair.feature_error(c.T_target_source),
         }
-        for c in others
-        if c.odds >= 1  # by itself more likely right than not
+        for c in rivals
     ]
     read = {"source": source.read, "target": pair.target.read}
     return Registration(
         T_target_source=T,
-        status="aligned" if best.confidence >= ALIGNED else "uncertain",
+        status="aligned" if aligned else "uncertain",
         confidence=best.confidence,
         overlap=best.evidence.overlap,
         inlier_rmse=best.evidence.inlier_rmse,
@@ -112,13 +119,13 @@ def describe(
         information=np.linalg.pinv(certain.covariance, rcond=1e-12, hermitian=True),
         covariance=certain.covariance,
         origin=pair.target.centre,
-        undetermined=observability.undetermined(certain.information, pair.boxes[1].unit / 2),
+        undetermined=weak,
         alternatives=alternatives,
         evidence=asdict(best.evidence),
         voxel_size=pair.edge,
         points={**read, "source_used": len(pair.s.points), "target_used": len(pair.t.points)},
         options=options,
-        warnings=["other poses fit about as well, see alternatives"] if alternatives else [],
+        reasons=[] if aligned else [*reasons, *doubts(pair, best, rivals)],
     )
 
 
