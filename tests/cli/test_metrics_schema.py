@@ -30,6 +30,8 @@ def test_the_metrics_have_the_keys_and_types_of_the_golden_file(fmr_here, sample
     assert "total" in metrics["seconds"]
     assert set(map(type, metrics["seconds"].values())) == {float}
     metrics["seconds"] = {"total": metrics["seconds"]["total"]}
+    for name, kind in (("warnings", str), ("undetermined", str), ("feature_errors", float)):  # as many as there are
+        assert all(type(value) is kind for value in metrics.pop(name))
     alternative = {"T_target_source", "confidence", "feature_error"}
     assert all(set(found) == alternative for found in metrics.pop("alternatives"))
     found = schema(metrics)

@@ -20,7 +20,7 @@ from fmr_cli.descriptors.patch_encoder import (
 )
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.models import bundled_local_encoder
-from fmr_cli.training.local import LocalNet
+from fmr_cli.training.local_task import LocalNet
 
 Scans = tuple[np.ndarray, np.ndarray]
 Patches = dict[str, np.ndarray]

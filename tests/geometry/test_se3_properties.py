@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from fmr_cli.geometry import se3
 
-MANY = settings(derandomize=True, deadline=None, max_examples=60, database=None)
+MANY = settings(derandomize=True, deadline=None, max_examples=30, database=None)
 
 directions = arrays(float, 3, elements=st.floats(-1, 1)).filter(lambda v: np.linalg.norm(v) > 1e-3)
 angles = st.floats(0, np.pi - 1e-3)  # at half a turn the axis has two signs

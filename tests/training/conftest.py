@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -22,3 +24,9 @@ def tiny() -> Recipe:
 def data() -> Data:
     pool = torch.from_numpy(shapes(24, 128, seed=0))
     return Data(pool[:16], pool[16:], described=["16 procedural shapes, 8 held out"])
+
+
+@pytest.fixture(scope="session")
+def samples_folder() -> Path:
+    """Where the two sample scans are."""
+    return Path(__file__).parents[2] / "samples"
