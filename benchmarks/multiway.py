@@ -167,7 +167,7 @@ def make(kind: str, out: Path, count: int | None, seed: int) -> None:
     for number, (points, eye) in enumerate(zip(views, eyes, strict=True)):
         T = np.eye(4)  # world to scan
         T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
-        T[:3, 3] = -T[:3, :3] @ eye
+        T[:3, 3] = rng.uniform(-10, 10, 3) - T[:3, :3] @ eye
         name = f"scan_{rng.integers(10**6):06d}_{number}"
         write_cloud(out / "scans" / f"{name}.ply", PointCloud(points @ T[:3, :3].T + T[:3, 3]))
         np.savetxt(out / "truth.tmp" / f"{name}.txt", np.linalg.inv(T))

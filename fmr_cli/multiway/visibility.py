@@ -19,7 +19,7 @@ from fmr_cli.registration.prepared import SPACINGS, Prepared
 FINER = 2.0  # times the grid on which pairs are registered
 ROWS = 60  # of the range image from pole to pole: cells of 3 degrees
 BEHIND = 2.0  # fine edges, and SLANT of the range: a point that far behind another of its cell is hidden by it
-SLANT = 0.15
+SLANT = 0.08  # more, and from far off, where all lies at about one range, nothing would be hidden
 APART = 3.0  # fine edges that a scan must see beyond a point to see through it
 NEAR = 2.5  # fine edges within which a point has its counterpart
 SEEN = 3  # points of a cell, below which it says nothing
