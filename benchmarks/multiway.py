@@ -211,6 +211,8 @@ def errors(poses: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> tuple[
     """Degrees and lengths (n,) of poses about the best common frame."""
     names = sorted(poses)
     G = best_frame(np.stack([poses[n][:3, 3] for n in names]), np.stack([truth[n][:3, 3] for n in names]))
+    if len(names) < 4:  # too few places for a rotation: that of the first scan
+        G = truth[names[0]] @ np.linalg.inv(poses[names[0]])
     off = [
         (angle_degrees(np.linalg.inv(truth[n]) @ G @ poses[n]), np.linalg.norm((G @ poses[n] - truth[n])[:3, 3]))
         for n in names

@@ -15,7 +15,7 @@ def room_views(seed: int, count: int, points: int = 9_000) -> tuple[list[np.ndar
     clouds, truth = [], []
     for k in range(count):
         eye = np.array([0.5 * np.cos(k), 0.5 * np.sin(k), 1.4])
-        view = scenes.room_scan(room, rng, eye, 0.7 * k)
+        view = scenes.room_scan(room, rng, eye, 0.7 * k, views=10)
         T_world_scan = np.eye(4)
         T_world_scan[:3, :3] = Rotation.random(random_state=rng).as_matrix()
         T_world_scan[:3, 3] = rng.uniform(-5, 5, 3)

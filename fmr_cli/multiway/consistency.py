@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from fmr_cli.multiway.visibility import ONE_PLACE, doubt
 
 AGREE = 4.0  # voxel edges, root mean square over a scan, that poses of one link or cycle may differ by
 CHANCE = 0.05  # that a wrong hypothesis agrees with another by accident, or since a place repeats itself
-JOINED = 0.5  # probability from which scans are joined: that from which ``align`` calls a pose aligned
+JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself or two agree
 DENIALS = (
     (0.5, 3.0),
     (0.3, 1.0),
@@ -38,7 +38,10 @@ class Component:
 
 @dataclass(frozen=True)
 class Join:
-    """A pose between two components. probability: that it is right; against: the probability of the best rival."""
+    """A pose between two components. probability: that it is right; against: the probability of the best rival.
+
+    links: that agree on it, by number; sound: one of them is aligned by itself, or they are two; denied: links that deny.
+    """
 
     T_second_first: np.ndarray
     log_odds: float
@@ -46,6 +49,7 @@ class Join:
     against: float
     links: tuple[int, ...]
     denied: int
+    sound: bool
 
 
 @dataclass(frozen=True)
@@ -142,7 +146,11 @@ def joined(
     joins = {key: best_join(components[key[0]], components[key[1]], links, some, silent[key], moments, overlap)
              for key, some in between.items()}  # fmt: skip
     while True:
-        sure = [(join.log_odds, -key[0], -key[1]) for key, join in joins.items() if join.probability >= JOINED]
+        sure = [
+            (join.log_odds, -key[0], -key[1])
+            for key, join in joins.items()
+            if join.probability >= JOINED and join.sound
+        ]
         if not sure:
             break
         _, a, b = max(sure)
@@ -229,13 +237,13 @@ def best_join(
             penalty = next((x for least, x in DENIALS if shared >= least), 0.0)
             denied += penalty > 0
             score -= penalty
-        best.append(Join(T_join[lead], score, 0.0, 0.0, tuple(sorted(agreed)), denied))
+        sound = len(agreed) > 1 or links[ranked[lead].link].status == "aligned"
+        best.append(Join(T_join[lead], score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
     odds = np.exp(np.clip([join.log_odds for join in best], -50, 50))
     top = int(odds.argmax())
     rest = float(np.delete(odds, top).max()) if len(odds) > 1 else 0.0
     total = 1 + float(odds.sum())
-    return Join(best[top].T_second_first, best[top].log_odds, float(odds[top]) / total, rest / total, best[top].links,
-                best[top].denied)  # fmt: skip
+    return replace(best[top], probability=float(odds[top]) / total, against=rest / total)
 
 
 def implied(first: Component, second: Component, link: Link, choice: int) -> np.ndarray:
