@@ -15,7 +15,7 @@ import numpy as np
 
 from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.looks import displacement
-from fmr_cli.multiway.visibility import ONE_PLACE, doubt
+from fmr_cli.multiway.visibility import CONTRADICTED, ONE_PLACE, doubt
 
 AGREE = 4.0  # voxel edges, root mean square over a scan, that poses of one link or cycle may differ by
 CHANCE = 0.05  # that a wrong hypothesis agrees with another by accident, or since a place repeats itself
@@ -25,6 +25,7 @@ DENIALS = (
     (0.3, 1.0),
 )  # at so much overlap a link that found nothing is e^-x as likely if the join is right
 RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
+DENIED = 6.0  # log odds that a join loses by each link at whose pose one scan sees through the other
 CERTAIN = 12.0  # log odds, at most, of one hypothesis
 
 
@@ -40,7 +41,7 @@ class Component:
 class Join:
     """A pose between two components. probability: that it is right; against: the probability of the best rival.
 
-    links: that agree on it, by number; sound: one of them is aligned by itself, or they are two; denied: links that deny.
+    links: that agree on it, by number; sound: one is aligned by itself, or they are two; denied: how many deny it.
     """
 
     T_second_first: np.ndarray
@@ -54,11 +55,12 @@ class Join:
 
 @dataclass(frozen=True)
 class Claim:
-    """One hypothesis of one link, with its log odds, cycles included."""
+    """One hypothesis of one link, with its log odds, cycles included; contradicted: one scan sees through the other."""
 
     link: int
     choice: int
     log_odds: float
+    contradicted: bool = False
 
 
 def log_odds(h: Hypothesis, one_place: bool) -> float:
@@ -103,7 +105,8 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
                         agreed = np.where(off < reach, odds - np.log(CHANCE), 0.0)
                         best = max(best, float(agreed.max()))
                 support += best
-            found.append(Claim(number, choice, alone[number][choice] + min(support, CERTAIN)))
+            contradicted = one_place and h.seen_through >= CONTRADICTED
+            found.append(Claim(number, choice, alone[number][choice] + min(support, CERTAIN), contradicted))
     return found
 
 
@@ -218,6 +221,7 @@ def best_join(
         if taken[lead] or len(best) == RIVALS:
             continue
         agreed: dict[int, float] = {}
+        contradicted: set[int] = set()
         for k, claim in enumerate(ranked):
             link = links[claim.link]
             scan = link.source if link.source in first.T_component_scan else link.target
@@ -226,9 +230,11 @@ def best_join(
             if off < AGREE * lenient * link.edge:
                 taken[k] = True
                 agreed[claim.link] = max(agreed.get(claim.link, -np.inf), claim.log_odds)
+                contradicted |= {claim.link} if claim.contradicted else set()
         score = ranked[lead].log_odds
         score += sum(max(x - np.log(CHANCE), 0.0) for n, x in agreed.items() if n != ranked[lead].link)
-        denied = 0
+        denied = len(contradicted)
+        score -= DENIED * denied
         for number in [n for n in tried if n not in agreed][:DENIERS]:
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
