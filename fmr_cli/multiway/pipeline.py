@@ -209,7 +209,7 @@ class Survey:
                 )
             )
             self.note_twins()
-        usable = [n for n, edge in own.items() if edge is not None]
+        usable = sorted(self.frames)
         self.failed = set(own) - set(usable)
         if not usable:
             raise FmrError(f"none of {len(own)} scans can be used; the first: {self.messages[0]}")
@@ -459,12 +459,13 @@ class Survey:
 
     def fixed(self) -> dict[int, np.ndarray]:
         """The centred poses of the scans that don't move."""
-        world, found = self.world(), {}
-        for n in self.fixed_numbers:
-            if n in self.edges:
-                pose = self.poses[n].T_world_scan if n in self.poses else np.eye(4)
-                found[n] = enter_frames(pose, self.frames[n], world)
-        return found
+        world = self.world()
+        return {n: enter_frames(pose, self.frames[n], world) for n, pose in self.fixed_poses().items()}
+
+    def fixed_poses(self) -> dict[int, np.ndarray]:
+        """T_world_scan, files' coordinates, of the scans that don't move."""
+        given = {n: self.poses[n].T_world_scan if n in self.poses else np.eye(4) for n in self.fixed_numbers}
+        return {n: pose for n, pose in given.items() if n in self.edges}
 
     def priors(self) -> list[Prior]:
         """Known poses of scans that may move."""
