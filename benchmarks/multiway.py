@@ -167,7 +167,7 @@ def make(kind: str, out: Path, count: int | None, seed: int) -> None:
     for number, (points, eye) in enumerate(zip(views, eyes, strict=True)):
         T = np.eye(4)  # world to scan
         T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
-        T[:3, 3] = -T[:3, :3] @ eye
+        T[:3, 3] = rng.uniform(-10, 10, 3) - T[:3, :3] @ eye
         name = f"scan_{rng.integers(10**6):06d}_{number}"
         write_cloud(out / "scans" / f"{name}.ply", PointCloud(points @ T[:3, :3].T + T[:3, 3]))
         np.savetxt(out / "truth.tmp" / f"{name}.txt", np.linalg.inv(T))
@@ -211,6 +211,8 @@ def errors(poses: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> tuple[
     """Degrees and lengths (n,) of poses about the best common frame."""
     names = sorted(poses)
     G = best_frame(np.stack([poses[n][:3, 3] for n in names]), np.stack([truth[n][:3, 3] for n in names]))
+    if len(names) < 4:  # too few places for a rotation: that of the first scan
+        G = truth[names[0]] @ np.linalg.inv(poses[names[0]])
     off = [
         (angle_degrees(np.linalg.inv(truth[n]) @ G @ poses[n]), np.linalg.norm((G @ poses[n] - truth[n])[:3, 3]))
         for n in names

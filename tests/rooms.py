@@ -6,6 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fmr_cli.synthetic import scenes
+from fmr_cli.synthetic.sensors import terrestrial_scan
+
+NOISE = 0.002  # m
 
 
 def room_views(seed: int, count: int, points: int = 9_000) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -14,8 +17,9 @@ def room_views(seed: int, count: int, points: int = 9_000) -> tuple[list[np.ndar
     room = scenes.room(rng)
     clouds, truth = [], []
     for k in range(count):
-        eye = np.array([0.5 * np.cos(k), 0.5 * np.sin(k), 1.4])
-        view = scenes.room_scan(room, rng, eye, 0.7 * k)
+        eye = np.array([0.7 * np.cos(k), 0.7 * np.sin(k), 1.4 + 0.05 * k])
+        view = terrestrial_scan(room, rng, eye, 20.0, columns=160).points
+        view = view + rng.normal(size=view.shape) * NOISE
         T_world_scan = np.eye(4)
         T_world_scan[:3, :3] = Rotation.random(random_state=rng).as_matrix()
         T_world_scan[:3, 3] = rng.uniform(-5, 5, 3)

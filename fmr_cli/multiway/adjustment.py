@@ -41,10 +41,10 @@ def adjust(survey: Survey) -> Network:
             refined = refine(survey, component, solution, anchor)
         world = survey.world() if component.held else survey.frames[anchor]
         to_world = np.eye(4) if component.held else np.linalg.inv(refined.T_component_scan[anchor])
+        given = {anchor: np.eye(4)} if not component.held else survey.fixed_poses()
         for n in sorted(component.T_component_scan):
             found = [to_world @ poses.T_component_scan[n] for poses in (solution, refined)]
-            graph, T = (np.eye(4) if n == anchor and not component.held else leave_frames(pose, survey.frames[n], world)
-                        for pose in found)  # fmt: skip
+            graph, T = (given.get(n, leave_frames(pose, survey.frames[n], world)) for pose in found)
             scans[n].status, scans[n].component = "placed", len(anchors)
             scans[n].T_component_scan, scans[n].T_component_scan_graph = T, graph
             component.T_component_scan[n] = refined.T_component_scan[n]

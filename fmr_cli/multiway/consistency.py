@@ -9,22 +9,23 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.looks import displacement
-from fmr_cli.multiway.visibility import ONE_PLACE, doubt
+from fmr_cli.multiway.visibility import CONTRADICTED, ONE_PLACE, doubt
 
 AGREE = 4.0  # voxel edges, root mean square over a scan, that poses of one link or cycle may differ by
 CHANCE = 0.05  # that a wrong hypothesis agrees with another by accident, or since a place repeats itself
-JOINED = 0.5  # probability from which scans are joined: that from which ``align`` calls a pose aligned
+JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself or two agree
 DENIALS = (
     (0.5, 3.0),
     (0.3, 1.0),
 )  # at so much overlap a link that found nothing is e^-x as likely if the join is right
 RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
+DENIED = 6.0  # log odds that a join loses by each link at whose pose one scan sees through the other
 CERTAIN = 12.0  # log odds, at most, of one hypothesis
 
 
@@ -38,7 +39,10 @@ class Component:
 
 @dataclass(frozen=True)
 class Join:
-    """A pose between two components. probability: that it is right; against: the probability of the best rival."""
+    """A pose between two components. probability: that it is right; against: the probability of the best rival.
+
+    links: that agree on it, by number; sound: one is aligned by itself, or they are two; denied: how many deny it.
+    """
 
     T_second_first: np.ndarray
     log_odds: float
@@ -46,15 +50,17 @@ class Join:
     against: float
     links: tuple[int, ...]
     denied: int
+    sound: bool
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One hypothesis of one link, with its log odds, cycles included."""
+    """One hypothesis of one link, with its log odds, cycles included; contradicted: one scan sees through the other."""
 
     link: int
     choice: int
     log_odds: float
+    contradicted: bool = False
 
 
 def log_odds(h: Hypothesis, one_place: bool) -> float:
@@ -99,7 +105,8 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
                         agreed = np.where(off < reach, odds - np.log(CHANCE), 0.0)
                         best = max(best, float(agreed.max()))
                 support += best
-            found.append(Claim(number, choice, alone[number][choice] + min(support, CERTAIN)))
+            contradicted = one_place and h.seen_through >= CONTRADICTED
+            found.append(Claim(number, choice, alone[number][choice] + min(support, CERTAIN), contradicted))
     return found
 
 
@@ -142,7 +149,11 @@ def joined(
     joins = {key: best_join(components[key[0]], components[key[1]], links, some, silent[key], moments, overlap)
              for key, some in between.items()}  # fmt: skip
     while True:
-        sure = [(join.log_odds, -key[0], -key[1]) for key, join in joins.items() if join.probability >= JOINED]
+        sure = [
+            (join.log_odds, -key[0], -key[1])
+            for key, join in joins.items()
+            if join.probability >= JOINED and join.sound
+        ]
         if not sure:
             break
         _, a, b = max(sure)
@@ -210,6 +221,7 @@ def best_join(
         if taken[lead] or len(best) == RIVALS:
             continue
         agreed: dict[int, float] = {}
+        contradicted: set[int] = set()
         for k, claim in enumerate(ranked):
             link = links[claim.link]
             scan = link.source if link.source in first.T_component_scan else link.target
@@ -218,9 +230,11 @@ def best_join(
             if off < AGREE * lenient * link.edge:
                 taken[k] = True
                 agreed[claim.link] = max(agreed.get(claim.link, -np.inf), claim.log_odds)
+                contradicted |= {claim.link} if claim.contradicted else set()
         score = ranked[lead].log_odds
         score += sum(max(x - np.log(CHANCE), 0.0) for n, x in agreed.items() if n != ranked[lead].link)
-        denied = 0
+        denied = len(contradicted)
+        score -= DENIED * denied
         for number in [n for n in tried if n not in agreed][:DENIERS]:
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
@@ -229,13 +243,13 @@ def best_join(
             penalty = next((x for least, x in DENIALS if shared >= least), 0.0)
             denied += penalty > 0
             score -= penalty
-        best.append(Join(T_join[lead], score, 0.0, 0.0, tuple(sorted(agreed)), denied))
+        sound = len(agreed) > 1 or links[ranked[lead].link].status == "aligned"
+        best.append(Join(T_join[lead], score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
     odds = np.exp(np.clip([join.log_odds for join in best], -50, 50))
     top = int(odds.argmax())
     rest = float(np.delete(odds, top).max()) if len(odds) > 1 else 0.0
     total = 1 + float(odds.sum())
-    return Join(best[top].T_second_first, best[top].log_odds, float(odds[top]) / total, rest / total, best[top].links,
-                best[top].denied)  # fmt: skip
+    return replace(best[top], probability=float(odds[top]) / total, against=rest / total)
 
 
 def implied(first: Component, second: Component, link: Link, choice: int) -> np.ndarray:

@@ -38,7 +38,7 @@ class Link:
     """Two scans, by number, and what registering them has given.
 
     status: as ``align`` says, "failed" where it could not, "rejected" where the network has thrown it out.
-    start: "features", "auto", "pose" (from where the network had it), "known" (given, not registered).
+    start: "look" (from a look's pose), "auto", "pose" (from where the network had it), "known" (given, not registered).
     hypotheses: best first. information: (6, 6) of a twist (rotation, translation) in the target's centred frame.
     chosen: the hypothesis that agrees with the network, or None.
     """

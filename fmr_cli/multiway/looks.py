@@ -21,7 +21,7 @@ from fmr_cli.registration.prepared import LARGEST_RATIO, Prepared
 
 KEYPOINTS = 500
 TOLERANCE = 2.0  # voxel edges that a matched point, or a point and its counterpart, may lie apart
-POSES = 3  # that the matches agree on most; the right one is hardly ever further down
+POSES = 6  # that the matches agree on most; the right one is hardly ever further down
 SAMPLE = 800  # points that are brought onto the other scan
 FEW = 3  # matches that agree: fewer fix no pose
 WORDS = 32  # of the vocabulary that scans are compared by (VLAD)
@@ -49,10 +49,11 @@ class Description:
 
 @dataclass(frozen=True)
 class Look:
-    """How promising a pair is, from 0; and the pose that says so, between the centred frames."""
+    """How promising a pair is, from 0; the pose that says so, between the centred frames; and other poses, less so."""
 
     promise: float
     T_target_source: np.ndarray
+    others: tuple[Look, ...] = ()
 
 
 def describe(scan: Prepared, edge: float) -> Description:
@@ -89,13 +90,18 @@ def look(source: Description, target: Description, motion: Motion) -> Look:
     edge = source.edge
     x, y = source.keypoints[mutual] / edge, target.keypoints[forth[mutual]] / edge
     poses, votes = consensus(x, y, TOLERANCE, POSES, motion)
-    best = Look(0.0, np.eye(4))
+    found = []
     for T, count in zip(poses, votes, strict=True):
         T[:3, 3] *= edge
         if count >= FEW:
-            promise = float(coincidence(source, target, T) * np.sqrt(count))
-            best = max(best, Look(promise, T), key=lambda found: found.promise)
-    return best
+            found.append(Look(float(coincidence(source, target, T) * np.sqrt(count)), T))
+    return best_of(found)
+
+
+def best_of(found: Sequence[Look]) -> Look:
+    """The most promising pose with the others behind it."""
+    ranked = sorted(found, key=lambda x: -x.promise)
+    return Look(ranked[0].promise, ranked[0].T_target_source, tuple(ranked[1:])) if ranked else Look(0.0, np.eye(4))
 
 
 def coincidence(source: Description, target: Description, T_target_source: np.ndarray) -> float:

@@ -209,7 +209,7 @@ class Survey:
                 )
             )
             self.note_twins()
-        usable = [n for n, edge in own.items() if edge is not None]
+        usable = sorted(self.frames)
         self.failed = set(own) - set(usable)
         if not usable:
             raise FmrError(f"none of {len(own)} scans can be used; the first: {self.messages[0]}")
@@ -303,23 +303,31 @@ class Survey:
         Nothing is changed where even each scan's best look is contradicted: such scans weren't taken from one place.
         """
         pairs = [p for p, x in self.looks.items() if x.promise >= PROMISING]
-        shares = self.each("comparing views", lambda p: self.seen_through(*p, self.looks[p].T_target_source), pairs)
+
+        def shares(pair: tuple[int, int]) -> list[float]:
+            look = self.looks[pair]
+            promising = [x for x in (look, *look.others) if x.promise >= PROMISING]
+            return [self.seen_through(*pair, x.T_target_source) for x in promising]
+
+        seen = dict(zip(pairs, self.each("comparing views", shares, pairs), strict=True))
         least: dict[int, float] = {}
-        for pair, share in zip(pairs, shares, strict=True):
+        for pair, found in seen.items():
             for n in pair:
-                least[n] = min(least.get(n, 1.0), share)
-        if least and float(np.median(list(least.values()))) <= ROUGHLY_ONE_PLACE:
-            for pair, share in zip(pairs, shares, strict=True):
-                factor = 1 / (1 + (share / ROUGHLY_CONTRADICTED) ** 2)
-                self.looks[pair] = replace(self.looks[pair], promise=factor * self.looks[pair].promise)
+                least[n] = min(least.get(n, 1.0), *found)
+        if not least or float(np.median(list(least.values()))) > ROUGHLY_ONE_PLACE:
+            return
+        for pair, found in seen.items():
+            look = self.looks[pair]
+            factors = [1 / (1 + (share / ROUGHLY_CONTRADICTED) ** 2) for share in found]
+            poses = zip((look, *look.others), factors, strict=False)
+            self.looks[pair] = looks.best_of([replace(x, promise=f * x.promise, others=()) for x, f in poses])
 
     def look(self, pair: tuple[int, int]) -> looks.Look:
         edge = max(self.pair_edge(*pair), 1e-300)
         a, b = (self.description(n, edge) for n in pair)
         found = looks.look(a, b, self.motion(*pair, edge))
-        return (
-            found if self.allowed(pair[0], pair[1], found.T_target_source) else looks.Look(0.0, found.T_target_source)
-        )
+        poses = [replace(x, others=()) for x in (found, *found.others)]
+        return looks.best_of([x for x in poses if self.allowed(pair[0], pair[1], x.T_target_source)])
 
     def viewed(self, number: int) -> visibility.Viewed:
         if number not in self.views:
@@ -389,6 +397,10 @@ class Survey:
             init = leave_frames(T_target_source, self.frames[source], self.frames[target])
         return Attempt(source, target, start, replace(self.options, init=init, max_shift=None))
 
+    def from_look(self, source: int, target: int) -> Attempt:
+        """A pair to register from the pose of its look: cheap where it is right, and where it is not."""
+        return self.attempt(source, target, "look", self.looks[source, target].T_target_source)
+
     def register(self, attempts: list[Attempt]) -> None:
         """Registers pairs, or recalls what the journal has of them, and brings the components up to date."""
 
@@ -447,12 +459,13 @@ class Survey:
 
     def fixed(self) -> dict[int, np.ndarray]:
         """The centred poses of the scans that don't move."""
-        world, found = self.world(), {}
-        for n in self.fixed_numbers:
-            if n in self.edges:
-                pose = self.poses[n].T_world_scan if n in self.poses else np.eye(4)
-                found[n] = enter_frames(pose, self.frames[n], world)
-        return found
+        world = self.world()
+        return {n: enter_frames(pose, self.frames[n], world) for n, pose in self.fixed_poses().items()}
+
+    def fixed_poses(self) -> dict[int, np.ndarray]:
+        """T_world_scan, files' coordinates, of the scans that don't move."""
+        given = {n: self.poses[n].T_world_scan if n in self.poses else np.eye(4) for n in self.fixed_numbers}
+        return {n: pose for n, pose in given.items() if n in self.edges}
 
     def priors(self) -> list[Prior]:
         """Known poses of scans that may move."""
@@ -493,10 +506,10 @@ class Survey:
     def register_most_promising(self) -> None:
         """Each scan's most promising pairs, and those whose known poses say that they overlap."""
         chosen: dict[tuple[int, int], None] = {}
-        pairs = self.untried("features")
+        pairs = self.untried("look")
         for n in sorted(self.edges):
             chosen.update(dict.fromkeys([p for p in pairs if n in p][:FIRST]))
-        attempts = [self.attempt(*p, "features") for p in sorted(chosen)]
+        attempts = [self.from_look(*p) for p in sorted(chosen)]
         for n in sorted(self.poses.keys() & self.edges.keys()):
             for m in sorted(k for k in self.poses.keys() & self.edges.keys() if k < n and self.possible(n, k)):
                 T, slack = self.predicted(n, m)
@@ -507,10 +520,10 @@ class Survey:
     def join_components(self) -> None:
         """The most promising pairs that lead out of each component, until one is left or none is promising."""
         for _ in range(ROUNDS):
-            chosen = self.leading_out(self.untried("features"), NEXT)
+            chosen = self.leading_out(self.untried("look"), NEXT)
             if len(self.components) == 1 or not chosen:
                 return
-            self.register([self.attempt(*p, "features") for p in chosen])
+            self.register([self.from_look(*p) for p in chosen])
 
     def leading_out(self, pairs: list[tuple[int, int]], most: int) -> list[tuple[int, int]]:
         """Of pairs, best first, the first ``most`` of each component that join it to another one."""

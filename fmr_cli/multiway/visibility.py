@@ -19,15 +19,15 @@ from fmr_cli.registration.prepared import SPACINGS, Prepared
 FINER = 2.0  # times the grid on which pairs are registered
 ROWS = 60  # of the range image from pole to pole: cells of 3 degrees
 BEHIND = 2.0  # fine edges, and SLANT of the range: a point that far behind another of its cell is hidden by it
-SLANT = 0.15
+SLANT = 0.08  # more, and from far off, where all lies at about one range, nothing would be hidden
 APART = 3.0  # fine edges that a scan must see beyond a point to see through it
 NEAR = 2.5  # fine edges within which a point has its counterpart
 SEEN = 3  # points of a cell, below which it says nothing
 STARTS, FEW, MANY, DESCENTS, STEPS = 300, 3_000, 12_000, 3, 50  # of the search for the viewpoint
 SAMPLE = 4_000  # points that are brought into the other scan's view
 
-# Shares of points that are seen through, on the building of `python -m benchmarks.multiway` with viewpoints found by the
-# scans alone: right poses 0.000 to 0.020 (median 0.0005), wrong ones 0.010 to 0.38 (median 0.05).
+# Shares of points that are seen through, on the building of `python -m benchmarks.multiway` with viewpoints found
+# by the scans alone: right poses 0.000 to 0.020 (median 0.0005), wrong ones 0.010 to 0.38 (median 0.05).
 CONTRADICTED = 0.01  # takes as much off a pose's log odds as the surest link has; see ``doubt``
 ONE_PLACE = 0.004  # of each scan's best link, in the median: above it, scans were not taken from one place each
 
