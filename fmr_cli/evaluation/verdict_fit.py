@@ -1,45 +1,93 @@
-"""The verdict's weights from evidence: logistic regression over the poses of a pair, of which at most one is right."""
+"""The verdict's weights from evidence: what ``models/verdict.json`` holds, and how true they are on other pairs."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import minimize
 
-from fmr_cli.evaluation.verdict_evidence import LOOKS, EvidenceTable
+from fmr_cli.evaluation.verdict_evidence import Judged
+from fmr_cli.registration.confidence import Weights, confidences, products, standing
 
-RIDGE = 3e-3  # on the standardised weights: next to nothing where the evidence decides, finite where it separates
-LARGEST_EXPONENT = 50.0  # of e: beyond it, odds are certain, and further from overflow than 600
+RIDGE = 2e-3  # on the standardised weights of support and fit: next to nothing where the evidence decides
+PRODUCT_RIDGE = 3.0  # on those of the verdict, of as many observations: of 3, 10 and 30 the best on other pairs
+TINY = 1e-9  # a probability below it is a rounding error
+STARTS = (0.3, 1.0)  # all weights, where the fit begins
+FOLDS = 5
+QUALITY = slice(2, 5)  # of ``Evidence.vector``: what ``Evidence.quality`` gives
 
 
-def fit(evidence: EvidenceTable) -> np.ndarray:
-    """Weights (k,) by which the right pose of each pair, or "none of them", is most likely; a small ridge.
+def fit(evidence: Sequence[Judged]) -> Weights:
+    """The weights by which the right pose of each pair, or "none of them", is most likely.
 
-    No kind of evidence may count against its own sense: what one kind happens to say about another in these scans need
-    not hold elsewhere.
+    Support and fit first, together; then the verdict on what stands first by them. No kind of evidence of the former
+    may count against its own sense: what one happens to say about another in these scans need not hold elsewhere.
     """
-    x, y, pair = evidence.x, evidence.right, evidence.pair
-    spread = np.append(1.0, x[:, 1:].std(0))
-    some = np.bincount(pair) > 0
-    none = np.bincount(pair, y)[some] == 0
+    support, quality = fit_support(evidence)
+    eleven = np.ones(11)
+    first = Weights(support, quality, 0 * eleven, eleven, np.zeros(78))
+    standings = [standing(j.x, first) for j in evidence]
+    x = np.array([s for _, s in standings])
+    best = [int(np.argsort(-weigh, kind="stable")[0]) for weigh, _ in standings]
+    right = np.array([j.right[i] for j, i in zip(evidence, best, strict=True)])
+    known = Weights(support, quality, x.mean(0), x.std(0) + 1e-6, np.zeros(78))
+    return Weights(support, quality, known.mean, known.std, logistic(products(x, known), right))
+
+
+def fit_support(evidence: Sequence[Judged]) -> tuple[np.ndarray, np.ndarray]:
+    """(9,) and (3,): support s and fit f, under which pose i is right with s_i times its share of all s_j exp(f_j)."""
+    x = np.concatenate([j.x for j in evidence])
+    right = np.concatenate([j.right for j in evidence])
+    pair = np.repeat(np.arange(len(evidence)), [len(j.x) for j in evidence])
+    spread, none = np.append(1.0, x[:, 1:].std(0) + TINY), np.bincount(pair, right) == 0
 
     def loss(w: np.ndarray) -> float:
-        odds = np.exp(np.clip((x / spread) @ w, -LARGEST_EXPONENT, LARGEST_EXPONENT))
-        each, right = (np.bincount(pair, o)[some] for o in (odds, odds * y))
-        return float(np.mean(np.log1p(each) - np.log(np.where(none, 1, right))) + RIDGE * (w[1:] ** 2).mean())
+        s = 1 / (1 + np.exp(-np.clip(x @ (w[:9] / spread), -50, 50)))
+        f = x[:, QUALITY] @ (w[9:] / spread[QUALITY])
+        highest = np.full(len(evidence), -np.inf)
+        np.maximum.at(highest, pair, f)
+        weigh = s * np.exp(np.clip(f - highest[pair], -50, 0))
+        p = s * weigh / np.maximum(np.bincount(pair, weigh)[pair], 1e-300)
+        each, hit = np.bincount(pair, p), np.bincount(pair, p * right)
+        return float(-np.log(np.maximum(np.where(none, 1 - each, hit), TINY)).mean() + RIDGE * (w[1:] ** 2).mean())
 
-    bounds = [(None, None)] + [(0, None)] * (x.shape[1] - 1)
-    return minimize(loss, np.zeros(x.shape[1]), method="L-BFGS-B", bounds=bounds).x / spread
-
-
-def judge(evidence: EvidenceTable, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What ``align`` would say of each pair: the confidence of its best pose (pairs,), and whether that is right."""
-    groups = [np.flatnonzero(evidence.pair == i) for i in np.unique(evidence.pair)]
-    odds = np.exp(np.clip(evidence.x @ weights, -LARGEST_EXPONENT, LARGEST_EXPONENT))
-    first = [here[odds[here].argmax()] for here in groups]
-    confidence = [odds[i] / (1 + odds[here].sum()) for i, here in zip(first, groups, strict=True)]
-    return np.array(confidence), evidence.right[first]
+    bounds = [(None, None)] + [(0, None)] * 11
+    found = [minimize(loss, np.append(0.0, np.full(11, s)), method="L-BFGS-B", bounds=bounds) for s in STARTS]
+    best = min(found, key=lambda m: m.fun).x
+    return best[:9] / spread, best[9:] / spread[QUALITY]
 
 
-def fitted_half(evidence: EvidenceTable) -> np.ndarray:
-    """(n,) which poses belong to the half of the pairs that is fitted, half of each of the LOOKS; the rest judges."""
-    return evidence.pair % (2 * len(LOOKS)) < len(LOOKS)
+def logistic(x: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Weights (k,) of x (n, k), its first column 1, by which right (n,) is most likely; a ridge on the others."""
+
+    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
+        z, ridge = x @ w, np.append(0.0, w[1:]) * PRODUCT_RIDGE
+        value = np.logaddexp(0, np.where(right, -z, z)).sum() + w @ ridge / 2
+        return float(value), x.T @ (1 / (1 + np.exp(-z)) - right) + ridge
+
+    return minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 1000}).x
+
+
+def judge(evidence: Sequence[Judged], weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+    """What ``align`` would say of each look: the confidence of its best pose (n,), and whether that is right (n,)."""
+    said = []
+    for j in evidence:
+        shares, weigh = confidences(j.x, weights)
+        best = np.argsort(-weigh, kind="stable")[0]
+        said.append((shares[best], j.right[best]))
+    confidence, right = zip(*said, strict=True)
+    return np.array(confidence), np.array(right)
+
+
+def cross_validated(
+    evidence: Sequence[Judged], fit: Callable[[Sequence[Judged]], Weights] = fit
+) -> tuple[np.ndarray, np.ndarray]:
+    """``judge`` of each look by weights that were fitted on other pairs, one of FOLDS at a time."""
+    confidence, right = np.zeros(len(evidence)), np.zeros(len(evidence), bool)
+    for fold in range(FOLDS):
+        here = [i for i, j in enumerate(evidence) if j.number % FOLDS == fold]
+        if here:
+            weights = fit([j for j in evidence if j.number % FOLDS != fold])
+            confidence[here], right[here] = judge([evidence[i] for i in here], weights)
+    return confidence, right

@@ -38,8 +38,9 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     With A = Σ w J Jᵀ and g_b = Σ w J r over block b of neighbouring voxels, the covariance is A⁻¹ (Σ g_b g_bᵀ) A⁻¹ (the
     sandwich of cluster-robust regression, Liang and Zeger 1986): it holds however the residuals within a block hang
     together, be it by noise that voxels share or by a surface that is bent. Where the residuals' own optimum lies
-    further from the pose than this covariance allows, it grows to what allows it (Birge's ratio). A misfit beyond the surfaces' own
-    roughness, as of scans that are bent or drifted, is the same over large parts, of which there are BENDS.
+    further from the pose than this covariance allows, it grows to what allows it (Birge's ratio). A misfit beyond
+    the surfaces' own roughness, as of scans that are bent or drifted, is the same over
+    large parts, of which there are BENDS.
     """
     A, scores, misfits, sums = np.zeros((6, 6)), [], [], np.zeros(2)
     back = np.linalg.inv(T_target_source)

@@ -1,4 +1,4 @@
-"""How noisy a cloud is, told by its own neighbourhoods, and its points put onto the planes that these have in common."""
+"""How noisy a cloud is, told by its own neighbourhoods, and its points put onto the planes that these show."""
 
 from __future__ import annotations
 

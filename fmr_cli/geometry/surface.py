@@ -41,7 +41,7 @@ class Surface:
 
     @property
     def solid(self) -> np.ndarray:
-        """(M,) which points have neighbours enough to be a piece of surface; the others may be dust or a LiDAR's rim."""
+        """(M,) which points have neighbours enough to be a piece of surface; others are dust or a LiDAR's rim."""
         return self._shape[2] < SPARSE * self.edge
 
     @cached_property

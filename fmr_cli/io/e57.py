@@ -39,7 +39,7 @@ def library() -> Any:
         from pye57 import libe57
     except ImportError:
         raise CloudFileError(
-            "needs the library pye57, which is there for x86-64: pip install 'fmr-cli[e57]', or export it as .las or .ply"
+            "needs the library pye57, for x86-64: pip install 'fmr-cli[e57]', or export it as .las or .ply"
         ) from None
     return libe57
 
@@ -171,7 +171,7 @@ def points_of(
 
 
 def write(path: Path, stream: CloudStream) -> list[str]:
-    """Each scan of the stream with its pose, or all points as one; coordinates and attributes in their own precision."""
+    """Each scan of the stream with its pose, or all points as one; all in their own precision."""
     lib = library()
     survey = stream.survey
     fields, warnings = fields_of(survey, split=True, eight_bit=True)

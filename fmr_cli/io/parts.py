@@ -11,7 +11,7 @@ from fmr_cli.errors import CloudFileError
 
 @dataclass(frozen=True)
 class ScanPart:
-    """One scan of a file. T_file_scan: (4, 4), its own frame to the file's common one. count: of points, also invalid."""
+    """One scan of a file. T_file_scan: (4, 4), its own frame to the file's common one. count: of all its points."""
 
     name: str
     T_file_scan: np.ndarray

@@ -21,7 +21,7 @@ FIELDS = ("intensity", *COLORS)
 
 def scans(path: Path) -> list[ScanPart]:
     """Name, pose and number of points of each scan; they have no names but their numbers."""
-    found = []
+    found: list = []
     with open_text(path) as file:
         lines = Lines(file)
         while (head := read_header(lines, len(found))) is not None:

@@ -1,19 +1,23 @@
-"""Is a pose right? The evidence at it, the odds that this gives, and what rivals leave of them.
+"""Is a pose right? The evidence at it, what rivals leave of it, and the probability that this gives.
 
-A pose may be wrong in two ways: the scans do not belong together there, or they fit as well elsewhere. So its
-confidence is a product. Its support, by logistic regression on all the evidence, says how likely a pose that fits like
-this one is right if it has no rival. Among rivals counts alone how well each fits in its own common region: a facade
-that is shifted by a bay shows the more of itself the more it overlaps, and is no more right for it.
+A pose may be wrong in two ways: the scans do not belong together there, or they fit as well elsewhere. The first is
+told by its support, a logistic regression on all the evidence at it. Among rivals counts alone how well each fits in
+its own common region: a facade that is shifted by a bay shows the more of itself the more it overlaps, and is no more
+right for it. What then stands first is judged by its evidence, its margin over the rivals and their products, again by
+logistic regression.
 
-The evidence is dimensionless. The weights come from ``python -m benchmarks.calibrate``, fitted on made-up scans that
-no test uses.
+The evidence is dimensionless. The weights are in ``models/verdict.json``, fitted by ``python -m benchmarks.calibrate``
+on made-up scans that no test uses.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from importlib.resources import files
 
 import numpy as np
 
@@ -21,12 +25,12 @@ from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.registration.agreement import Agreement, agreement
 from fmr_cli.registration.pair import Pair
 
-ALIGNED = 0.8  # confidence from which a pose is called aligned: beyond what a person would check
-# `python -m benchmarks.calibrate`: of ``Evidence.vector``
-SUPPORT = np.array([-3.659, 0.856, 1.301, 0.0, 0.293, 0.0, 0.309, 2.316, 0.0])
-FIT = np.array([0.829, 0.0, 1.642])  # of ``Evidence.quality``
+ALIGNED = 0.8  # confidence from which a pose is called aligned: above what a person would check
 MOST_STRETCH = 0.05  # a stretch beyond it is as bad
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
+RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be right
+MARGIN = (-3.0, 6.0)  # of the margins over rivals: beyond, they say no more; the upper one also where there is no rival
+DEVIATIONS = 3.0  # of what the fit has seen: beyond, products of evidence would run away
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +46,11 @@ class Evidence(Agreement):
     votes: int
     repeats: float = 0.0
 
+    @property
+    def merit(self) -> float:
+        """Which of two refinements of one pose is the better one."""
+        return self.explained - self.contradicted + self.votes
+
     def quality(self) -> np.ndarray:
         """How well the surfaces fit where they meet, more is better: (3,)."""
         ratios = [1 / self.offset, 1 / self.turn, (self.explained + 10) / (self.contradicted + 10)]
@@ -56,25 +65,71 @@ class Evidence(Agreement):
         )
 
 
-def support(evidence: Evidence) -> float:
-    """The probability that a pose with this evidence is right if it has no rival."""
-    return float(1 / (1 + np.exp(-np.clip(SUPPORT @ evidence.vector(), -SURE_LOGIT, SURE_LOGIT))))
+@dataclass(frozen=True)
+class Weights:
+    """What the fit gives. support: (9,) of ``Evidence.vector``; fit: (3,) of ``Evidence.quality``.
+
+    mean, std: (11,) of ``standing`` where it was fitted; verdict: (1 + 11 + 66,) of 1, ``standing`` and its products.
+    """
+
+    support: np.ndarray
+    fit: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+    verdict: np.ndarray
 
 
-def confidences(evidence: Sequence[Evidence]) -> list[float]:
-    """The probability of each of several distinct poses, of which at most one is right."""
-    supports = np.array([support(e) for e in evidence])
-    fits = np.array([FIT @ e.quality() for e in evidence])
-    weights = supports * np.exp(np.clip(fits - fits.max(initial=-np.inf), -SURE_LOGIT, 0.0))
-    return (supports * weights / max(weights.sum(), 1e-300)).tolist()
+@cache
+def bundled_weights() -> Weights:
+    """Those of ``models/verdict.json``."""
+    given = json.loads((files("fmr_cli.models") / "verdict.json").read_text("utf-8"))
+    return Weights(*(np.array(given[name]) for name in ("support", "fit", "mean", "std", "verdict")))
+
+
+def support(x: np.ndarray, weights: Weights) -> np.ndarray:
+    """The probability that poses with evidence x (n, 9) are right if they have no rival: (n,)."""
+    return 1 / (1 + np.exp(-np.clip(x @ weights.support, -SURE_LOGIT, SURE_LOGIT)))
+
+
+def standing(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+    """Of distinct poses of one pair, x (n, 9) their evidence: what each weighs among the others (n,), the best 1 or
+    less, and how the first of them stands (11,): its evidence, its margins over the others, its support as a logit.
+    """
+    supports, fits = support(x, weights), x[:, 2:5] @ weights.fit
+    weigh = supports * np.exp(np.clip(fits - fits.max(), -SURE_LOGIT, 0.0))
+    first, *others = np.argsort(-weigh, kind="stable")
+    rival = max((fits[i] for i in others if supports[i] >= RIVAL_SUPPORT), default=-np.inf)
+    votes = max((x[i, 1] for i in others), default=0.0)
+    margins = np.clip([fits[first] - rival, x[first, 1] - votes], *MARGIN)
+    return weigh, np.array([*x[first, 1:], *margins, np.clip(x[first] @ weights.support, -10, 10)])
+
+
+def products(standings: np.ndarray, weights: Weights) -> np.ndarray:
+    """1, standings (n, 11) in deviations from the mean, and their products: (n, 78)."""
+    z = np.clip((standings - weights.mean) / weights.std, -DEVIATIONS, DEVIATIONS)
+    i, j = np.triu_indices(z.shape[1])
+    return np.column_stack([np.ones(len(z)), z, z[:, i] * z[:, j]])
+
+
+def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+    """The probability of each of several distinct poses, x (n, 9) their evidence, of which at most one is right; and
+    what each weighs among the others. The first has what the verdict gives it, the others share the rest.
+    """
+    weigh, first = standing(x, weights)
+    p = float(1 / (1 + np.exp(-np.clip(products(first[None], weights)[0] @ weights.verdict, -SURE_LOGIT, SURE_LOGIT))))
+    best = int(np.argsort(-weigh, kind="stable")[0])
+    rest = np.delete(weigh, best).sum()
+    shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
+    shares[best] = p
+    return shares, weigh
 
 
 @dataclass
 class Candidate:
     """A refined pose between the centred frames, with what speaks for it.
 
-    start: where it came from; errors: mean |r| of the IC solver that led to it. support: see ``support``; confidence:
-    that it is right, given the other candidates; set once these are known.
+    start: where it came from; errors: mean |r| of the IC solver that led to it. support: see ``support``; weight:
+    what it weighs among the others; confidence: that it is right, given these.
     """
 
     T_target_source: np.ndarray
@@ -82,6 +137,7 @@ class Candidate:
     errors: list[float]
     evidence: Evidence
     support: float = 0.0
+    weight: float = 0.0
     confidence: float = 0.0
 
 
@@ -95,36 +151,50 @@ class Judge:
     pair: Pair
     repeats: float = 0.0
     candidates: list[Candidate] = field(default_factory=list)
+    weights: Weights = field(default_factory=bundled_weights)
 
     def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:
         """Gather the evidence at a pose, and weigh all candidates anew."""
         found = agreement(self.pair.s, self.pair.t, T_target_source)
         evidence = Evidence(**asdict(found), votes=self.pair.inlier_count(T_target_source), repeats=self.repeats)
-        new = Candidate(T_target_source, start, errors, evidence, support(evidence))
-        log.debug("%s: support %.3f, %s", start, new.support, evidence)
+        new = Candidate(T_target_source, start, errors, evidence)
         kept: list[Candidate] = []
-        for c in sorted([*self.candidates, new], key=lambda c: -c.evidence.explained * c.support):
+        for c in sorted([new, *self.candidates], key=lambda c: -c.evidence.merit):
             if not any(self.pair.same(c.T_target_source, k.T_target_source) for k in kept):
                 kept.append(c)
         self.weigh(kept)
 
     def weigh(self, candidates: list[Candidate]) -> None:
-        """Each candidate's confidence given the others; best first."""
-        shares = confidences([c.evidence for c in candidates])
-        weighed = [replace(c, confidence=p) for c, p in zip(candidates, shares, strict=True)]
-        self.candidates = sorted(weighed, key=lambda c: -c.confidence)
+        """Weigh candidates against each other, best first, in a scene that repeats itself as much as is known."""
+        seen = [replace(c.evidence, repeats=self.repeats) for c in candidates]
+        x = np.array([e.vector() for e in seen])
+        weighed = [
+            replace(c, evidence=e, support=float(s), weight=float(w), confidence=float(p))
+            for c, e, s, w, p in zip(
+                candidates, seen, support(x, self.weights), *confidences(x, self.weights)[::-1], strict=True
+            )
+        ]
+        self.candidates = sorted(weighed, key=lambda c: -c.weight)
 
     def found_repeats(self, repeats: float) -> None:
         """Take into account how much of the scene repeats itself."""
         self.repeats = max(self.repeats, repeats)
-        evidence = [replace(c.evidence, repeats=self.repeats) for c in self.candidates]
-        self.weigh([
-            replace(c, evidence=e, support=support(e)) for c, e in zip(self.candidates, evidence, strict=True)
-        ])  # fmt: skip
+        self.weigh(self.candidates)
 
     def knows(self, T_target_source: np.ndarray) -> bool:
         """Whether a candidate has that pose already."""
         return any(self.pair.same(T_target_source, c.T_target_source) for c in self.candidates)
+
+    def last_word(self, T_target_source: np.ndarray) -> str:
+        """What is known of a pose, for the log."""
+        known = [c for c in self.candidates if self.pair.same(T_target_source, c.T_target_source)]
+        if not known:
+            return "no candidate"
+        c, e = known[0], known[0].evidence
+        return (
+            f"{e.explained} points explained, {e.contradicted} contradicted, offset {e.offset:.2f}, {e.votes} matches, "
+            f"support {c.support:.2f}, confidence {c.confidence:.2f}"
+        )
 
     @property
     def best(self) -> Candidate:

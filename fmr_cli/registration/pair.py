@@ -60,6 +60,12 @@ class Pair:
                     )
                 raise RegistrationError(f"{cloud.name}: {what}")
 
+    @property
+    def flat_planes(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The normals of source and target where both are flat by nature, see ``geometry.planar``."""
+        s, t = self.source.plane, self.target.plane
+        return None if s is None or t is None else (s, t)
+
     # In the files' coordinates, and in the encoder's unit box.
 
     def enter_centred(self, T_target_source: np.ndarray) -> np.ndarray:

@@ -87,6 +87,13 @@ def look(source: Prepared, target: Prepared, options: Options, threads: int, tim
             consider(judge, features(judge.pair, time), time)
             if judge.sure(SURE):
                 return judge
+    return further(source, target, options, threads, time)
+
+
+def further(
+    source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch, enough: float = SURE
+) -> Judge:
+    """What fine voxels, more places and other scales find, until a pose has ``enough`` confidence."""
     judge = Judge(make_pair(source, target, options, threads, *FURTHER[0]))
     pair = judge.pair
     if not isinstance(options.init, str) or options.init in ("identity", "centroid"):
@@ -96,7 +103,7 @@ def look(source: Prepared, target: Prepared, options: Options, threads: int, tim
             with suppress(RegistrationError):
                 seen = pair if coarseness == 1.0 else make_pair(source, target, options, threads, coarseness, keypoints)
                 consider(judge, features(seen, time), time)
-            if judge.sure(SURE):
+            if judge.sure(enough):
                 return judge
     likely = bool(judge.candidates) and judge.best.support >= LIKELY
     if options.init == "search" or (options.init == "auto" and not likely and may_overlap_fully(pair)):
@@ -153,6 +160,7 @@ def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
     T = refinement.refined(judge.pair, hypothesis)
     if judge.pair.allowed(T):
         judge.consider(T, hypothesis.start, hypothesis.errors)
+        log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
 
 
 def may_overlap_fully(pair: Pair) -> bool:

@@ -9,6 +9,7 @@ from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_RADIUS, LocalEnc
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.gicp import GicpCloud
+from fmr_cli.geometry.planar import plane_of, raised
 from fmr_cli.geometry.sampling import distinct, sample, thinned, working_scale
 from fmr_cli.geometry.smoothing import roughness
 from fmr_cli.geometry.strays import Strays, strays
@@ -48,7 +49,8 @@ class Prepared:
                 f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
             )
         self.name, self.read, self.seed = cloud.name, cloud.count, seed
-        self.points = points
+        self.plane = plane_of(points)
+        self.points = points if self.plane is None else raised(points, self.plane, rng)
         self.edge, self.spacing = working_scale(self.points, rng)
         self._surfaces, self._described, self._fine, self._gicp, self._roughness = (Memo(KEPT) for _ in range(5))
 

@@ -12,6 +12,7 @@ from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.inverse_compositional import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.geometry.gicp import GicpCloud, gicp
+from fmr_cli.geometry.planar import within_plane
 from fmr_cli.geometry.point_to_plane import constrained, point_to_plane, step_motion
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.se3 import exp
@@ -27,7 +28,7 @@ PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, I
 PLANE_REACHES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.7)  # voxel edges, a step each
 DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
-# `python -m benchmarks.noise`: roughness 0.22 at 1 % noise, below 0.08 without; 30 neighbours are best of 10 to 50 there
+# By benchmarks.noise: roughness is 0.22 at 1 % noise, below 0.08 without; 30 neighbours are the best of 10 to 50
 ROUGH, SMOOTHED_OVER = 0.12, 30
 SMOOTHED_REACHES = (1.0, 1.0, 0.7, 0.7, 0.5, 0.5)  # voxel edges, a step each
 GICP_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
@@ -99,7 +100,9 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
         return constrained(s, t, T_target_source, pair.edge, pair.motion.basis(), pair.options.scale)
     target = pair.target.for_gicp(GICP_TARGET, pair.edge, pair.threads)
     T = gicp_in_reach(pair, pair.source.fine(GICP_SOURCE, pair.edge), target, T_target_source)
-    return by_smoothed(pair, T) if noisy(pair) else T
+    T = by_smoothed(pair, T) if noisy(pair) else T
+    planes = pair.flat_planes
+    return T if planes is None else within_plane(T, *planes)
 
 
 def noisy(pair: Pair) -> bool:

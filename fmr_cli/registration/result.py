@@ -22,7 +22,7 @@ from fmr_cli.registration.pair import Pair
 from fmr_cli.registration.prepared import Prepared
 
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
-RIVALLING = 0.1  # of the best one's confidence, that an alternative has at least
+RIVALLING = 0.1  # of the best one's weight, that an alternative has at least
 
 
 @dataclass
@@ -44,7 +44,8 @@ class Registration:
     undetermined: the directions that the scans hardly determine, in words.
     alternatives: other poses that would be called aligned if alone, as of a symmetric shape, best first:
         T_target_source, confidence, feature_error.
-    reasons: why the status is not "aligned", in words. evidence: what the verdict is made of. points: points read and points used. seconds: wall time by stage, and total.
+    reasons: why the status is not "aligned", in words. evidence: what the verdict is made of.
+    points: points read and points used. seconds: wall time by stage, and total.
     """
 
     T_target_source: np.ndarray
@@ -90,8 +91,8 @@ def describe(
     T = pair.leave_centred(best.T_target_source)
     T[:3, :3] *= factor
     certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3))
-    rivals = [c for c in others if c.support >= LIKELY and c.confidence >= RIVALLING * best.confidence]
-    weak = observability.undetermined(certain.information, pair.boxes[1].unit / 2, pair.motion.basis())
+    rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
+    weak = observability.undetermined(certain.information, pair.boxes[1].unit / 2, in_use(pair))
     aligned = best.confidence >= ALIGNED and not weak
     reasons = [f"the scans do not determine: {'; '.join(weak)}"] if weak else []
     alternatives = [
@@ -127,6 +128,15 @@ def describe(
         options=options,
         reasons=[] if aligned else [*reasons, *doubts(pair, best, rivals)],
     )
+
+
+def in_use(pair: Pair) -> np.ndarray:
+    """The twists (6, d) that the motion may use: those of the options; of flat scans those within their plane."""
+    if pair.flat_planes is None or pair.motion.dof != "rigid":
+        return pair.motion.basis()
+    normal = pair.flat_planes[1]
+    across = np.linalg.svd(normal[None])[2][1:].T
+    return np.block([[normal[:, None], np.zeros((3, 2))], [np.zeros((3, 1)), across]])
 
 
 class Stopwatch:

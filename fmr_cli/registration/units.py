@@ -25,6 +25,6 @@ def unit_hint(source: np.ndarray, target: np.ndarray) -> str | None:
     coarse, fine = UNITS[factor]
     units = (coarse, fine) if sizes[0] < sizes[1] else (fine, coarse)
     return (
-        f"the target is {sizes[1] / sizes[0]:.3g} times as large as the source, as if the source were in {units[0]} and "
-        f"the target in {units[1]}: bring them to one unit, or let --scale find the factor"
+        f"the target is {sizes[1] / sizes[0]:.3g} times as large as the source, as if the source were in {units[0]} "
+        f"and the target in {units[1]}: bring them to one unit, or let --scale find the factor"
     )

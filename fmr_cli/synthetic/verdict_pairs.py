@@ -9,7 +9,7 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -54,6 +54,10 @@ class VerdictPair:
     probes: np.ndarray
     source_origin: np.ndarray | None = None
     target_origin: np.ndarray | None = None
+
+    def of(self, poses: list[np.ndarray]) -> VerdictPair:
+        """The same pair with these poses as the right ones."""
+        return replace(self, poses=poses)
 
     def displacement(self, T_target_source: np.ndarray) -> float:
         """How far a pose moves the source's points from the nearest right pose, on the mean over ``size``."""

@@ -65,7 +65,7 @@ def test_all_scans_in_the_files_frame(tmp_path: Path, suffix: str) -> None:
     moved = [transform_points(pose(k), points) for k, points in enumerate(LOCAL)]
     skipped = 3 if suffix == ".e57" else 0
     np.testing.assert_allclose(cloud.points, np.concatenate([moved[0], moved[1][skipped:]]), atol=1e-5)
-    assert cloud.dropped == (3 if suffix == ".e57" else 3)  # one padded, two without a return
+    assert cloud.dropped == 3  # one padded, two without a return
     assert np.bincount(cloud.attributes["scan"]).tolist() == [0, 40, 41 - skipped]
     assert set(cloud.attributes["intensity"]) == {0.25}
     assert cloud.attributes["blue"].dtype == np.uint8
@@ -106,7 +106,8 @@ def test_every_attribute_goes_through_an_e57_bit_for_bit(tmp_path: Path) -> None
     cloud = PointCloud(
         rng.normal(size=(500, 3)) + 6e5,
         {
-            "intensity": rng.random(500).astype(np.float32), "nx": rng.random(500), "row": np.arange(500, dtype=np.uint16),
+            "intensity": rng.random(500).astype(np.float32), "nx": rng.random(500),
+            "row": np.arange(500, dtype=np.uint16),
             "label": np.arange(500, dtype=np.int32) - 70_000, "timestamp": rng.random(500) + 1.7e9,
             "wide": np.arange(500) + 2**40,
         },
@@ -129,7 +130,8 @@ def test_spherical_coordinates(tmp_path: Path) -> None:
     reach = np.linalg.norm(xyz, axis=1)
     values = {
         "sphericalRange": reach, "sphericalAzimuth": np.arctan2(xyz[:, 1], xyz[:, 0]),
-        "sphericalElevation": np.arcsin(xyz[:, 2] / reach), "sphericalInvalidState": (np.arange(300) < 5).astype(np.int8),
+        "sphericalElevation": np.arcsin(xyz[:, 2] / reach),
+        "sphericalInvalidState": (np.arange(300) < 5).astype(np.int8),
     }  # fmt: skip
     with pye57.E57(str(tmp_path / "a.e57"), mode="w") as e57:
         file = e57.image_file
