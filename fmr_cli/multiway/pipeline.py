@@ -421,7 +421,9 @@ class Survey:
                 self.keep(replace(link, hypotheses=kept))
         with self.stage("see through"):
             new = [(link, h) for link in self.links.values() for h in link.hypotheses if id(h) not in self.judged]
-            shares = self.each("comparing views", lambda x: self.seen_through(*x[0].ends, x[1].T_target_source), new)
+            shares = self.each(
+                "comparing views", lambda x: self.seen_through(x[0].source, x[0].target, x[1].T_target_source), new
+            )
             for (_, h), share in zip(new, shares, strict=True):
                 h.seen_through = share
                 self.judged[id(h)] = h
