@@ -4,9 +4,9 @@
     python -m benchmarks.multiway street --out /tmp/street         # 200 scans of a spinning LiDAR: cost
     python -m benchmarks.multiway wrong --out /tmp/building        # its links, a tenth of them made wrong
 
-Scans are made once and kept in --out, each turned by any rotation. Said of each run: scans placed, placed wrongly
-(over 5 deg or 0.1 m off), position errors of the pose graph alone and after the joint refinement (about the best common
-frame), errors over the sigmas that were given, links, seconds, memory.
+Scans are made once per --out and kept there, each turned by any rotation. Said of each run: scans placed, placed
+wrongly (over 5 deg or 0.1 m off), position errors of the pose graph alone and after the joint refinement (about the best
+common frame), the sigmas that were given, links, seconds, memory.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def furnish(scene: Scene, rng: np.random.Generator, corner: np.ndarray, size: np
 def building(rng: np.random.Generator) -> tuple[Scene, list[np.ndarray]]:
     """Two corridors at a right angle with 16 offices along them, and 40 places to scan from.
 
-    Each office is scanned from its middle and from the threshold of its open door, the corridors between two doors and
-    from where they meet.
+    Each office is scanned from its middle and from the threshold of its open door, the corridors from between two doors
+    and from where they meet.
     """
     scene, eyes = Scene(), []
     scene.add(CUBE, [0, 0, -0.1], [60, 60, 0.1])

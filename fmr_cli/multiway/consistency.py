@@ -73,7 +73,7 @@ def from_one_place(links: list[Link]) -> bool:
     """Whether scans were taken from one place each, so that what they see through tells: by each scan's best link."""
     least: dict[int, float] = {}
     for link in links:
-        if link.status == "aligned" and link.start != "known":
+        if link.status == "aligned":
             for end in link.ends:
                 least[end] = min(least.get(end, 1.0), link.hypotheses[0].seen_through)
     return bool(least) and float(np.median(list(least.values()))) <= ONE_PLACE

@@ -87,7 +87,8 @@ def names(sources: Sequence[Path | PointCloud]) -> list[str]:
     paths = [source if isinstance(source, Path) else source.path for source in sources]
     found = [path.stem if path else f"cloud_{number:03d}" for number, path in enumerate(paths)]
     for depth in (1, 2, 3):
-        count = Counter(name.casefold() for name in found)
+        files = {(name.casefold(), path.resolve() if path else None) for name, path in zip(found, paths, strict=True)}
+        count = Counter(name for name, _ in files)  # one file given twice is no reason to call it by its folder
         for number, path in enumerate(paths):
             if path and count[found[number].casefold()] > 1:
                 folders = path.resolve().parent.parts[-depth:]
