@@ -16,6 +16,7 @@ from fmr_cli.synthetic.structures import Structure
 
 SENSORS = ("surface", "terrestrial", "lidar", "camera")
 ENOUGH = 12  # cells (1 / CELLS of a scan's size) that a detail covers in both scans, at least
+CONTRADICTING = 24  # cells of both scans' details, at least, that an alias takes to where nothing is
 SPREAD = 0.025  # least share of the common surface's normals along any direction: a bare wall and a floor have none
 LEAST = 40  # cells of the common surface
 SHARED = 0.3  # of the source that an alias has to lay on the target to be worth listing
@@ -127,7 +128,7 @@ def check_unique(structure: Structure, source: Scan, target: Scan) -> None:
             for (cells, tree, other), way in zip(details, (T, np.linalg.inv(T)), strict=True):
                 moved = transform_points(way, cells)
                 against += int((other.sees(moved) & (tree.query(moved)[0] > DIFFERENT * size)).sum())
-            if against < ENOUGH and not np.allclose(T, np.eye(4)):
+            if against < CONTRADICTING and not np.allclose(T, np.eye(4)):
                 raise Redraw
 
 

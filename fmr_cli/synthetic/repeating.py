@@ -141,7 +141,7 @@ def grid(kind: str, things: bool) -> Callable[[np.random.Generator], Draft]:
 def corridor(equal: bool) -> Callable[[np.random.Generator], Draft]:
     def make(rng: np.random.Generator) -> Draft:
         length = rng.uniform(8, 16)
-        shift = length * rng.uniform(0.05, 0.4)
+        shift = length * rng.uniform(0.05, 0.4 if equal else 0.25)
         s = structures.corridor(rng, -6, length + shift + 6, equal)
         sensor = str(rng.choice(["surface", "terrestrial", "lidar"], p=[0.4, 0.4, 0.2]))
         scans = []

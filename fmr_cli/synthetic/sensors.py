@@ -59,11 +59,11 @@ class Scan:
 def overlap(source: np.ndarray, target: np.ndarray, radius: float | None = None) -> tuple[float, float]:
     """The share of each scan's surface, both in one frame, that the other one has within ``radius``.
 
-    Counted on a grid of 2/3 ``radius``, so that a denser part of a scan counts no more than a sparse one; radius: 1.5
-    cells of the smaller scan unless given.
+    Counted on a grid of 2/3 ``radius``, so that a denser part of a scan counts no more than a sparse one; radius: a
+    cell of the smaller scan unless given.
     """
     size = min(np.ptp(source, axis=0).max(), np.ptp(target, axis=0).max())
-    radius = radius or 1.5 * size / CELLS
+    radius = radius or size / CELLS
     a, b = (voxel_downsample(points, radius / 1.5) for points in (source, target))
     return tuple(  # type: ignore[return-value]
         float(np.isfinite(cKDTree(y).query(x, distance_upper_bound=radius)[0]).mean()) for x, y in ((a, b), (b, a))

@@ -188,7 +188,7 @@ def corridor(rng: np.random.Generator, low: float, high: float, equal: bool) -> 
     width, height = rng.uniform(1.8, 3.5), rng.uniform(2.4, 3.2)
     s.shells = [0]
     s.box([low - 2, -width / 2, 0], [high + 2, width / 2, height])
-    period, deep = rng.uniform(1.8, 4.5), rng.uniform(0.15, 0.4)
+    period, deep = rng.uniform(1.8, 4.5), rng.uniform(0.2, 0.5)
     door = np.array([rng.uniform(0.8, 1.3), deep, rng.uniform(1.9, 2.2)])
     both = rng.random() < 0.5
     x = low
