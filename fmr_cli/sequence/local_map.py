@@ -8,6 +8,15 @@ import numpy as np
 import small_gicp
 
 from fmr_cli.cloud import transform_points
+from fmr_cli.sequence.observability import (
+    STANDING,
+    WRONG,
+    WRONG_STANDING,
+    Matches,
+    Observability,
+    clearly_observed,
+    observe,
+)
 from fmr_cli.sequence.plane_map import PlaneMap
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
@@ -22,6 +31,7 @@ MAP_KEYFRAMES = 20
 # What a point without counterpart costs where two poses are compared, in the unit of ``Fit.cost``. Set by hand: more
 # than a counterpart costs at the end of the reach that still fits.
 OUTLIER_COST = 4.0
+EVERY = 100  # points of a scan, of which one says how far it has moved since a keyframe
 NO_LRU = 1 << 30  # insertions after which small_gicp would forget a voxel: never
 
 
@@ -31,7 +41,8 @@ class Fit:
 
     overlap: the share of the scan's points that have a counterpart on the map. cost: their mean squared distance over
     the local variance, halved. start: the initial guess it came from. rms: distance of those points from the map's
-    planes, voxels, NaN before ``LocalMap.polish``.
+    planes, voxels, NaN before ``LocalMap.polish``; seen: which directions are observed, None before it, and where too
+    few points lie on planes to tell.
     """
 
     T_map_scan: np.ndarray
@@ -39,6 +50,7 @@ class Fit:
     cost: float
     start: str
     rms: float = float("nan")
+    seen: Observability | None = None
 
     @property
     def total(self) -> float:
@@ -100,12 +112,21 @@ class LocalMap:
         return Fit(T_map_scan, found.num_inliers / len(scan), found.error / inliers, start)
 
     def polish(self, scan: PreparedScan, fit: Fit, slope: float) -> tuple[Fit, float]:
-        """The fit with the pose that robust weights give, and this scan's slope.
+        """The fit with the pose that robust weights give, what is observed there, and this scan's slope.
 
         slope: how residuals grow with range, see ``plane_map.trust``.
         """
-        T_map_scan, rms, slope = self.planes.fit(scan.points, scan.normals, scan.ranges, fit.T_map_scan, slope)
-        return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms), slope
+        T_map_scan, rms, slope, matches = self.planes.fit(
+            scan.points, scan.normals, scan.ranges, fit.T_map_scan, slope
+        )  # fmt: skip
+        seen = self._seen(scan, T_map_scan, matches) if matches else None
+        return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms, seen=seen), slope
+
+    def _seen(self, scan: PreparedScan, T_map_scan: np.ndarray, matches: Matches) -> Observability:
+        some = scan.points[::EVERY]
+        moved = min(displacement(T_map_scan, keyframe.T_map_scan, some) for keyframe in self.keyframes)
+        wrong = WRONG_STANDING if moved < STANDING else WRONG
+        return clearly_observed(matches, wrong) or observe(matches, scan.trust[matches.index], wrong)
 
 
 def displacement(T_map_a: np.ndarray, T_map_b: np.ndarray, points: np.ndarray) -> float:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fmr_cli.errors import RegistrationError
-from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement, orthonormal
+from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
+from fmr_cli.sequence.motion_model import MotionModel
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
@@ -33,6 +34,12 @@ DOUBTFUL_OVERLAP, DOUBTFUL_TOTAL = 0.85, 1.25  # against the running medians: be
 CONVINCING = 2.3  # a ``total`` for which one start is enough; right poses have up to 2.1, wrong ones from 2.9
 TRUSTED_AFTER = 2  # aligned frames in a row, after which the prediction alone may do
 EXPECTED_ERROR = 3  # times the largest of the last prediction errors: so far may the next one be off
+# Times the distance from the map's planes, beyond which a scan held at the prediction does not fit there. In made-up
+# tunnels and before blank walls it comes to 1.04 at most, wherever along them the scan is held.
+WORSE = 1.1
+# Voxels: an unobserved direction whose sigma is beyond it could matter. Half the voxel that everything here is measured
+# by: 0.05 m for a depth camera in a room, 0.2 m for a LiDAR in a street.
+MATTERS = 0.5
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
 
@@ -48,7 +55,10 @@ class Frame:
     the scan is kept out of the map. overlap: share of its points with a counterpart on the map. inlier_rmse: their
     root mean square distance from the map's local planes, file units. start: where the accepted pose came from
     ("first", "prediction", "zero-motion", "features"). feature_errors: before and after, where the feature-metric
-    registration was asked.
+    registration was asked. unobserved: directions along which the scan does not tell its pose, in the first scan's
+    axes ("shift along (1.00, 0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once
+    sigma_shift (file units) or sigma_rotation (degrees), the pose's standard deviations along the worst direction,
+    could matter.
     """
 
     T_first_scan: np.ndarray
@@ -57,6 +67,9 @@ class Frame:
     inlier_rmse: float
     start: str
     feature_errors: FeatureErrors = None
+    unobserved: tuple[str, ...] = ()
+    sigma_shift: float = 0.0
+    sigma_rotation: float = 0.0
 
 
 class Odometry:
@@ -65,7 +78,7 @@ class Odometry:
     def __init__(self, frame: VoxelFrame) -> None:
         self.frame = frame
         self.map = LocalMap()
-        self.T_map_last: list[np.ndarray] = []  # the poses of the last two frames
+        self.motion: MotionModel | None = None  # from the first scan on
         self.last: tuple[int, PreparedScan, np.ndarray]  # index, scan, T_map_scan: the last one that could be used
         self.aligned = self.uncertain = 0  # frames in a row
         self.errors: deque[float] = deque(maxlen=ERRORS_KEPT)  # voxels, of the last predictions
@@ -80,29 +93,25 @@ class Odometry:
         Raises RegistrationError where it is the first one.
         """
         index, self.index = self.index, self.index + 1
-        if not self.T_map_last:
+        if self.motion is None:
             return self._begin(index, scan)
-        T_map_predicted = self.predict()
+        T_map_predicted = self.motion.predict()
         if scan is None:
             return self._bridge(index, None, T_map_predicted, Fit(T_map_predicted, 0.0, np.nan, "prediction"), None)
         fit, feature_errors = self._best_fit(scan, T_map_predicted)
         if not self._fits(fit):
             return self._bridge(index, scan, T_map_predicted, fit, feature_errors)
-        fit = self._polished(scan, fit)
+        fit = self._polished(scan, fit, T_map_predicted)
         self._accept(index, scan, T_map_predicted, fit)
-        return self._frame(fit.T_map_scan, "aligned", fit, feature_errors)
-
-    def predict(self) -> np.ndarray:
-        """T_map_scan of the next frame at constant velocity: the last motion again."""
-        last = self.T_map_last[-1]
-        return last if len(self.T_map_last) < 2 else orthonormal(last @ np.linalg.inv(self.T_map_last[-2]) @ last)
+        return self._frame(scan, fit, feature_errors)
 
     def _begin(self, index: int, scan: PreparedScan | None) -> Frame:
         if scan is None:
             raise RegistrationError("the first scan has too few points to start from, leave it out with --start")
         here = np.eye(4)
         self.map.insert(index, scan, here)
-        self.T_map_last, self.last, self.aligned = [here], (index, scan, here), 1
+        self.motion = MotionModel(here, float(np.sqrt((scan.ranges**2).mean())))
+        self.last, self.aligned = (index, scan, here), 1
         return Frame(np.eye(4), "aligned", 1.0, 0.0, "first")
 
     def _best_fit(self, scan: PreparedScan, T_map_predicted: np.ndarray) -> tuple[Fit, FeatureErrors]:
@@ -115,8 +124,9 @@ class Odometry:
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
                 return fit, None
             fits = [fit]
-        starts = {"zero-motion": self.T_map_last[-1]}
-        if len(self.T_map_last) > 1:
+        assert self.motion
+        starts = {"zero-motion": self.motion.T_map_last[-1]}
+        if len(self.motion.T_map_last) > 1:
             starts = {"prediction": T_map_predicted, **starts}
         fits += [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
         best = min(fits, key=lambda fit: fit.total)
@@ -144,19 +154,38 @@ class Odometry:
         overlap, total = np.median(self.usual, axis=0)
         return self._fits(fit) and fit.overlap > DOUBTFUL_OVERLAP * overlap and fit.total < DOUBTFUL_TOTAL * total
 
-    def _polished(self, scan: PreparedScan, fit: Fit) -> Fit:
-        fit, slope = self.map.polish(scan, fit, float(np.median(self.slopes)) if self.slopes else 0.0)
+    def _polished(self, scan: PreparedScan, fit: Fit, T_map_predicted: np.ndarray) -> Fit:
+        """The fit's exact pose; along directions that are not observed, the prediction's.
+
+        Two things can show that such a direction is observed after all: the scan does not fit there, or there all of
+        it is observed.
+        """
+        assert self.motion
+        usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
+        fit, slope = self.map.polish(scan, fit, usual_slope)
         if np.isfinite(slope):
             self.slopes.append(slope)
-        return fit
+        if fit.seen is None or fit.seen.observed.all():
+            return fit
+        held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, T_map_predicted, fit.seen))
+        there, _ = self.map.polish(scan, held, usual_slope)
+        if there.seen is None:
+            return replace(held, seen=fit.seen)
+        if there.seen.observed.all():
+            return there
+        if there.rms > WORSE * fit.rms:
+            return replace(fit, seen=fit.seen.as_observed())
+        return replace(there, T_map_scan=self.motion.combined(there.T_map_scan, T_map_predicted, there.seen))
 
     def _accept(self, index: int, scan: PreparedScan, T_map_predicted: np.ndarray, fit: Fit) -> None:
         """Take the fit as the pose, and the scan into the map where it has moved on or the map has grown stale."""
-        if len(self.T_map_last) > 1:
+        assert self.motion
+        if len(self.motion.T_map_last) > 1:
             self.errors.append(displacement(fit.T_map_scan, T_map_predicted, scan.points))
         self.usual.append((fit.overlap, fit.total))
         self.aligned, self.uncertain = self.aligned + 1, 0
-        self.T_map_last, self.last = [self.T_map_last[-1], fit.T_map_scan], (index, scan, fit.T_map_scan)
+        self.motion.advance(fit.T_map_scan, T_map_predicted, fit.seen)
+        self.last = (index, scan, fit.T_map_scan)
         self.best_total = min(self.best_total, fit.total)
         moved = displacement(fit.T_map_scan, self.map.keyframes[-1].T_map_scan, scan.points)
         if fit.total > KEYFRAME_RISE * self.best_total or moved > KEYFRAME_MOTION:
@@ -173,22 +202,44 @@ class Odometry:
     ) -> Frame:
         """Go on at the prediction; where that lasts, with a new map."""
         self.aligned, self.uncertain = 0, self.uncertain + 1
-        self.T_map_last = [self.T_map_last[-1], T_map_predicted]
+        assert self.motion
+        self.motion.advance(T_map_predicted, T_map_predicted, None)
         if scan is not None:
             self.last = (index, scan, T_map_predicted)
             if self.uncertain >= LOST_AFTER:  # the old map is out of sight: what follows is at least right in itself
                 self.map, self.uncertain, self.best_total = LocalMap(), 0, np.inf
                 self.map.insert(index, scan, T_map_predicted)
                 self.usual.clear()
-        return self._frame(T_map_predicted, "uncertain", fit, feature_errors)
+                self.motion.forget_place()
+        T_first_scan = self.frame.pose_to_file(T_map_predicted)
+        return Frame(T_first_scan, "uncertain", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
 
-    def _frame(self, T_map_scan: np.ndarray, status: str, fit: Fit, feature_errors: FeatureErrors) -> Frame:
-        T_first_scan = self.frame.pose_to_file(T_map_scan)
-        return Frame(T_first_scan, status, fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+    def _frame(self, scan: PreparedScan, fit: Fit, feature_errors: FeatureErrors) -> Frame:
+        """What came of a scan that fits."""
+        assert self.motion
+        T_first_scan = self.frame.pose_to_file(fit.T_map_scan)
+        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+        if fit.seen is None or fit.seen.observed.all():
+            return found
+        rotation, shift = self.motion.sigma(fit.seen.centre)
+        unclear = max(rotation * fit.seen.radius, shift) > MATTERS
+        return replace(
+            found, status="uncertain" if unclear else "aligned",
+            unobserved=tuple(fit.seen.unobserved),
+            sigma_shift=shift * self.frame.voxel, sigma_rotation=float(np.degrees(rotation)),
+        )  # fmt: skip
+
+    @property
+    def T_map_scan(self) -> np.ndarray:  # noqa: N802
+        """(4, 4): the last frame's pose."""
+        assert self.motion
+        return self.motion.T_map_last[-1]
 
     def state(self) -> dict[str, Any]:
-        """What ``restore`` needs besides every frame's T_map_scan (``T_map_last[-1]`` after each); JSON types."""
+        """What ``restore`` needs besides every frame's T_map_scan; JSON types."""
+        assert self.motion
         return {
+            "motion": self.motion.state(),
             "aligned": self.aligned,
             "uncertain": self.uncertain,
             "errors": list(self.errors),
@@ -204,7 +255,7 @@ class Odometry:
 
         T_map_scan: (4, 4) of every frame so far; load: gives a frame's scan as it was registered.
         """
-        self.index, self.T_map_last = len(T_map_scan), T_map_scan[-2:]
+        self.index, self.motion = len(T_map_scan), MotionModel.restored(state["motion"], T_map_scan[-2:])
         self.aligned, self.uncertain, self.best_total = state["aligned"], state["uncertain"], state["best_total"]
         self.errors.extend(state["errors"])
         self.usual.extend((overlap, total) for overlap, total in state["usual"])

@@ -66,7 +66,7 @@ def align_sequence(
             frame, seconds = timed(odometry.register, loaded.scan, scans.where(loaded.index))
             poses.append(frame.T_first_scan)
             rows.append(loaded.row | described(frame, poses) | {"register_s": seconds})
-            state = {"size": loaded.size, "T_map_scan": odometry.T_map_last[-1].tolist(), "state": odometry.state()}
+            state = {"size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(), "state": odometry.state()}
             files.add(rows[-1], poses[-1], loaded.cloud, state)
             if on_row:
                 on_row(rows[-1], len(rows), len(scans))
@@ -153,6 +153,9 @@ def described(frame: Frame, poses: list[np.ndarray]) -> dict[str, Any]:
         row["inlier_rmse"] = six_digits(frame.inlier_rmse)
     if frame.feature_errors:
         row["feature_error_before"], row["feature_error_after"] = map(six_digits, frame.feature_errors)
+    if frame.unobserved:
+        row["unobserved"] = "; ".join(frame.unobserved)
+        row["sigma_shift"], row["sigma_rotation_deg"] = map(six_digits, (frame.sigma_shift, frame.sigma_rotation))
     row["motion"] = six_digits(np.linalg.norm(T_before_scan[:3, 3]))
     row["rotation_deg"] = six_digits(angle_degrees(T_before_scan))
     return row

@@ -13,6 +13,7 @@ from fmr_cli.cloud import transform_points
 from fmr_cli.geometry.kernels import geman_mcclure
 from fmr_cli.geometry.point_to_plane import linearise, normal_equations, step_motion
 from fmr_cli.geometry.voxels import voxel_keys
+from fmr_cli.sequence.observability import Matches
 
 REACH = 1.5  # a point's plane is sought within
 FLAT = 0.8  # length of the mean normal, below which a voxel holds no plane
@@ -49,11 +50,12 @@ class PlaneMap:
 
     def fit(
         self, points: np.ndarray, normals: np.ndarray, ranges: np.ndarray, T: np.ndarray, slope: float
-    ) -> tuple[np.ndarray, float, float]:
+    ) -> tuple[np.ndarray, float, float, Matches | None]:
         """The pose near T of points with unit normals (N, 3), seen at ranges (N,).
 
         slope: how residuals grow with range in this sensor's scans, see ``trust``. Returns the pose, the RMS distance
-        from the planes, and this scan's own slope; T as it was and NaN where too few points lie on planes.
+        from the planes, this scan's own slope, and what was matched; T as it was, NaN and None where too few points lie
+        on planes.
         """
         if self.tree is None:
             self.means = self.sums[:, 1:4] / self.sums[:, :1]
@@ -71,7 +73,7 @@ class PlaneMap:
             on = (np.array(squared) < REACH**2) & self.flat[plane]
             on &= np.einsum("ij,ij->i", self.normals[plane], normals @ T[:3, :3].T) > AGREE
             if on.sum() < 6 * BANDS:
-                return T, float("nan"), float("nan")
+                return T, float("nan"), float("nan"), None
             p, n, offset, b = points[on], self.normals[plane[on]], self.means[plane[on]], band[on]
             for again in range(STEPS):
                 moved = transform_points(T, p)
@@ -88,7 +90,8 @@ class PlaneMap:
                 break
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
-        return T, float(np.sqrt((weight * r**2).sum() / weight.sum())), own
+        rms = float(np.sqrt((weight * r**2).sum() / weight.sum()))
+        return T, rms, own, Matches(np.flatnonzero(on), moved, normals[on] @ T[:3, :3].T, n, weight / worth, rms)
 
 
 def scale_by_band(r: np.ndarray, band: np.ndarray) -> np.ndarray:

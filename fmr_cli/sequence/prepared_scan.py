@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 WORKING_POINTS = 12_000
 POINTS_PER_VOXEL = 4  # of a scan that has few points, on average: finer voxels would hold no surface
 NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice
+TILT = 3.0  # times the scan's median error, at which a normal is half trusted
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
 STEPS = 6  # of the search for the voxel, at most; each brings the count within a few percent
 COUNT_TOLERANCE = 0.1  # share by which the count may miss WORKING_POINTS
@@ -46,6 +47,21 @@ class PreparedScan:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def trust(self) -> np.ndarray:
+        """(N,), 0 to 1: how far a normal can be trusted, beside those of the same scan.
+
+        At an edge, or where the neighbours are one ring of a spinning scanner, they fit no plane, and the normal there
+        is the scanner's pattern, the same in every scan.
+        """
+        from scipy.spatial import cKDTree
+
+        near = self.points[cKDTree(self.points).query(self.points, NEIGHBOURS)[1]]
+        arm = near - near.mean(1, keepdims=True)
+        values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", arm, arm))
+        tilt2 = np.maximum(values[:, 0], 0) / np.maximum(values[:, 1], 1e-12)  # variance of the normal, up to a factor
+        return 1 / (1 + (tilt2 / (TILT**2 * np.median(tilt2))) ** 2)
 
     @cached_property
     def for_align(self) -> Prepared:

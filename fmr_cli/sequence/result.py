@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+STRETCHES = 5  # that the summary tells of
+
 
 @dataclass(frozen=True)
 class SequenceResult:
@@ -15,7 +17,8 @@ class SequenceResult:
 
     poses: (n, 4, 4) float64, each scan's frame to the first one's, file units; the camera's where that was asked for.
     rows: one a frame: frame, file, status ("aligned" or "uncertain"), start, points, overlap, inlier_rmse, motion,
-    rotation_deg, seconds, and a message where something was wrong with the scan.
+    rotation_deg, seconds, and a message where something was wrong with the scan; where directions were not observed,
+    unobserved (in words), and sigma_shift and sigma_rotation_deg, how far off the pose may be along them.
     voxel_size: the working voxel edge, file units. odometry_poses: (n, 4, 4) before loops were closed, or None where
     that was not asked for; loops: how many were closed. out: the file of poses, or None.
     """
@@ -52,11 +55,36 @@ class SequenceResult:
                 f"residual: median {np.median(residuals):.4g}, "
                 f"worst {worst['inlier_rmse']:.4g} in frame {worst['frame']} ({worst['file']})"
             )
+        lines += not_observed(self.rows)
         if self.uncertain:
             names = ", ".join(f"{row['frame']} ({row['file']})" for row in self.uncertain[:20])
             more = len(self.uncertain) - 20
             lines.append(f"{len(self.uncertain)} uncertain, look at: {names}{f' and {more} more' if more > 0 else ''}")
         return lines
+
+
+def not_observed(rows: list[dict[str, Any]]) -> list[str]:
+    """A line for each stretch of frames that are uncertain because of what they did not observe; the longest few."""
+    stretches: list[list[dict[str, Any]]] = []
+    for row in rows:
+        if "unobserved" not in row or row["status"] == "aligned":
+            continue
+        if stretches and row["frame"] == stretches[-1][-1]["frame"] + 1:
+            stretches[-1].append(row)
+        else:
+            stretches.append([row])
+    told = sorted(sorted(stretches, key=len, reverse=True)[:STRETCHES], key=lambda stretch: stretch[0]["frame"])
+    lines = []
+    for stretch in told:
+        first, last = stretch[0]["frame"], stretch[-1]["frame"]
+        frames = f"frame {first}" if first == last else f"frames {first} to {last}"
+        worst = max(stretch, key=lambda row: row["sigma_shift"])
+        lines.append(
+            f"{frames}: {worst['unobserved']} not observed, sigma up to {worst['sigma_shift']:.3g} and "
+            f"{max(row['sigma_rotation_deg'] for row in stretch):.3g} deg"
+        )
+    more = len(stretches) - len(told)
+    return [*lines, f"{more} shorter stretches where something is not observed"] if more else lines
 
 
 def odometry_path(out: Path) -> Path:

@@ -1,0 +1,182 @@
+"""Which motions of a scan against the map are observed, and by how much noise alone can pretend that they are.
+
+A smooth tunnel, a blank wall or open ground lets a scan slide: whatever pose an alignment then gives along that
+direction is noise, most often "no motion", since a scanner's own pattern fits itself best where it was. Normals that
+are a little wrong hide it: through them every direction has some information. Two kinds of error are told apart.
+
+- Errors of a point's normal and of the map's beside it that are independent: the information of the one Jacobian times
+  the other keeps what is real and averages these to nothing, as the reliability ratio of errors-in-variables does.
+- Errors that both share, because the scanner's pattern on a curved surface or along an edge is the same in both: a
+  direction has to stand out from what normals pretend that are wrong by a few degrees, and normals of neighbours that
+  fit no plane count little.
+
+Lengths are in voxels. Constants without a reference are set by hand on made-up tunnels, corridors, walls and streets;
+the tests hold what they give there and on real drives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fmr_cli.geometry.point_to_plane import linearise
+
+# Of a direction's information, what must be real for it to count as observed: more than is not.
+RELIABLE = 0.5
+# Radians: what the normals of a scan and of the map are wrong by together. Where a scanner stands as it stood for a
+# keyframe its pattern is the same in both, and so are the errors; once it has moved on they mostly are not.
+WRONG, WRONG_STANDING = 0.05, 0.15
+STANDING = 0.3  # voxels that the points have moved since a keyframe, on average: where a pattern holds a scan fast
+LEAST_POINTS = 1.0  # that face a direction: what weighs less is chance
+LEAST_SIGMA = 0.01  # voxels, of the distances between points and planes; no scanner's are smaller
+# Share of the points that would have to face the weakest direction for it to be beyond doubt: it is not looked at more
+# closely, which takes longer than the alignment. So many times WRONG² (at WRONG 0.02, at WRONG_STANDING 0.07).
+CLEAR, CLEAR_TIMES = 0.02, 3.0
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Points of a scan on planes of the map, at the pose that they were fitted to.
+
+    index: (N,), which points. moved: (N, 3), they, map axes. scan_normals, map_normals: (N, 3), unit, map axes, as each
+    side sees the surface there. weight: (N,), robust, whatever their range. rms: of the distances between points and
+    planes.
+    """
+
+    index: np.ndarray
+    moved: np.ndarray
+    scan_normals: np.ndarray
+    map_normals: np.ndarray
+    weight: np.ndarray
+    rms: float
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Six directions of motion and what is known along each.
+
+    The motion of a twist (omega, v), map axes: x -> x + omega × (x - centre) + v. centre: (3,), of the points; radius:
+    their root mean square distance from it, which turns radians into displacement.
+    directions: (6, 6), a twist a column, independent of each other in the data. reliability: (6,), the share of each
+    one's information that is real, 0 where hardly any point contributes. information: (6, 6) of a twist, rad⁻² and
+    voxel⁻², of the observed directions together.
+    """
+
+    centre: np.ndarray
+    radius: float
+    directions: np.ndarray
+    reliability: np.ndarray
+    information: np.ndarray
+
+    @property
+    def observed(self) -> np.ndarray:
+        """(6,), True where a direction is observed."""
+        return self.reliability >= RELIABLE
+
+    def as_observed(self) -> Observability:
+        """The same where something else has shown that all directions are observed."""
+        return replace(self, reliability=np.maximum(self.reliability, RELIABLE))
+
+    @property
+    def unobserved(self) -> list[str]:
+        """The other directions, in words."""
+        return in_words(self.directions[:, ~self.observed], self.radius)
+
+
+@dataclass(frozen=True)
+class Jacobians:
+    """What each matched point says about a motion, once by the map's normal and once by its own.
+
+    centre, radius: as in ``Observability``. by_map, by_scan: (6, N), rotations as displacements at ``radius``.
+    weight: (N,).
+    """
+
+    centre: np.ndarray
+    radius: float
+    by_map: np.ndarray
+    by_scan: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def of(cls, matches: Matches, weight: np.ndarray) -> Jacobians:
+        centre = np.average(matches.moved, axis=0, weights=weight)
+        radius = float(np.sqrt(np.average(((matches.moved - centre) ** 2).sum(1), weights=weight)))
+        both = [
+            linearise(matches.moved, matches.moved, n, centre)[1] for n in (matches.map_normals, matches.scan_normals)
+        ]
+        scale = np.array([radius] * 3 + [1.0] * 3)[:, None]
+        return cls(centre, radius, both[0] / scale, both[1] / scale, weight)
+
+    def information(self) -> tuple[np.ndarray, np.ndarray]:
+        """(6, 6) each: by the map's normals alone, with all that is wrong with them; and by both, with what is real."""
+        H = (self.by_map * self.weight) @ self.by_map.T
+        cross = (self.by_map * self.weight) @ self.by_scan.T
+        return H + 1e-9 * np.trace(H) * np.eye(6), (cross + cross.T) / 2
+
+    def observability(self, H: np.ndarray, cross: np.ndarray, rms: float) -> Observability:
+        """The directions v with cross v = reliability H v, which mix neither in the one nor in the other."""
+        root = np.linalg.cholesky(H)
+        whitened = np.linalg.solve(root, np.linalg.solve(root, cross).T)
+        reliability, vectors = np.linalg.eigh((whitened + whitened.T) / 2)
+        directions = np.linalg.solve(root.T, vectors)
+        facing = reliability / np.linalg.norm(directions, axis=0) ** 2  # so many points would weigh as much
+        reliability = np.where(facing >= LEAST_POINTS, reliability, 0.0)
+        known = np.where(reliability >= RELIABLE, reliability, 0.0) / max(rms, LEAST_SIGMA) ** 2
+        inverse = np.linalg.inv(directions)
+        scale = np.array([self.radius] * 3 + [1.0] * 3)
+        information = np.outer(scale, scale) * (inverse.T @ (known[:, None] * inverse))
+        return Observability(self.centre, self.radius, directions / scale[:, None], reliability, information)
+
+
+def clearly_observed(matches: Matches, wrong: float) -> Observability | None:
+    """What matched points say about the pose they are at, where no direction is weak; else None.
+
+    wrong: radians that the normals of both sides are wrong by together.
+    """
+    jacobians = Jacobians.of(matches, matches.weight)
+    H, cross = jacobians.information()
+    if np.linalg.eigvalsh(cross)[0] < max(CLEAR, CLEAR_TIMES * wrong**2) * matches.weight.sum():
+        return None
+    return jacobians.observability(H, cross, matches.rms).as_observed()
+
+
+def observe(matches: Matches, trust: np.ndarray, wrong: float) -> Observability:
+    """The same, however weak; trust: (N,), 0 to 1, in their normals."""
+    jacobians = Jacobians.of(matches, matches.weight * trust)
+    H, cross = jacobians.information()
+    arm = (matches.moved - jacobians.centre) / jacobians.radius
+    return jacobians.observability(H + wrong**2 * across(arm, jacobians), cross, matches.rms)
+
+
+def across(arm: np.ndarray, jacobians: Jacobians) -> np.ndarray:
+    """(6, 6): the information that normals pretend which are wrong by 1 in every direction across them.
+
+    arm: (N, 3), points about their centre over their radius. With the Jacobian (arm × e, e) of an error e, this is
+    Σ w (G Gᵀ - g gᵀ), G = [hat(arm); I], g = (arm × n, n).
+    """
+    weight = jacobians.weight
+    moment, second = weight @ arm, (arm * weight[:, None]).T @ arm
+    all_sides = np.zeros((6, 6))
+    all_sides[:3, :3] = np.trace(second) * np.eye(3) - second
+    all_sides[3:, 3:] = weight.sum() * np.eye(3)
+    all_sides[:3, 3:] = np.cross(moment, np.eye(3)).T
+    all_sides[3:, :3] = all_sides[:3, 3:].T
+    return all_sides - (jacobians.by_map * weight) @ jacobians.by_map.T
+
+
+def in_words(twists: np.ndarray, radius: float) -> list[str]:
+    """The span of twists (6, k) as shifts and rotations, those first that are pure shifts; axes of the map."""
+    if twists.shape[1] == 0:
+        return []
+    scale = np.array([radius] * 3 + [1.0] * 3)[:, None]
+    span = np.linalg.qr(twists * scale)[0]  # displacements
+    _, turning, mix = np.linalg.svd(span[:3], full_matrices=True)
+    turning = np.concatenate([turning, np.zeros(len(mix) - len(turning))])
+    said = []
+    for share, vector in sorted(zip(turning, (span @ mix.T).T, strict=True), key=lambda item: item[0]):
+        kind, axis = ("shift along", vector[3:]) if share < np.sqrt(0.5) else ("rotation about", vector[:3])
+        axis = axis / np.linalg.norm(axis)
+        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+        said.append("{} ({:.2f}, {:.2f}, {:.2f})".format(kind, *(np.round(axis, 2) + 0.0)))  # + 0.0: no -0.00
+    return said
