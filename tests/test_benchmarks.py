@@ -97,13 +97,14 @@ def test_the_card_of_the_encoder_can_be_measured_again() -> None:
         assert clouds in said
 
 
-def test_calibrate_prints_weights_and_keeps_the_evidence(tmp_path: Path) -> None:
-    said = run("benchmarks.calibrate", "--pairs", "6", "--workers", "1", "--out", str(tmp_path))
-    assert "poses of 6 pairs" in said
+def test_calibrate_writes_weights_in_the_form_of_the_bundled_ones(tmp_path: Path) -> None:
+    said = run("benchmarks.calibrate", "--pairs", "8", "--workers", "1", "--out", str(tmp_path))
+    assert "looks at 8 pairs" in said
     assert said.count("confidence   pairs  right") == 1
-    weights = json.loads(said.split("WEIGHTS, fitted on all:")[1].splitlines()[0])
-    with np.load(tmp_path / "evidence.npz") as evidence:
-        assert evidence["x"].shape == (len(evidence["y"]), len(weights))
+    made, bundled = (json.loads(p.read_text()) for p in (tmp_path / "verdict.json", ROOT / "models" / "verdict.json"))
+    assert {name: len(values) for name, values in made.items() if name != "made by"} == {
+        name: len(values) for name, values in bundled.items() if name != "made by"
+    }
 
 
 def test_the_pairs_of_starts_are_turned_with_their_truth(room_scans: tuple) -> None:

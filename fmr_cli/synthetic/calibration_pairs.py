@@ -16,7 +16,10 @@ from fmr_cli.synthetic.verdict_pairs import FAMILIES, KINDS, VerdictPair, make_p
 UNTOUCHED = 0.35  # of the others stay as they are
 WAVES = 4
 LENGTHS = 2.0, 8.0  # radians of a wave over a scan's size: a third of a wave to more than one
-BENDS = 10**-3.0, 10**-1.9  # amplitudes, shares of the size: 1 to 12 mm a metre, as fragments of a hand-held camera show
+BENDS = (
+    10**-3.0,
+    10**-1.9,
+)  # amplitudes, shares of the size: 1 to 12 mm a metre, as fragments of a hand-held camera show
 # What may not be bent: there, a bend would decide what the pair is about.
 UNBENT = {
     *FAMILIES["degenerate"],

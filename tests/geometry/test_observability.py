@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from fmr_cli.geometry import observability
+from fmr_cli.geometry.point_to_plane import point_to_plane, step_motion
+from fmr_cli.geometry.se3 import log
 from fmr_cli.geometry.surface import Surface
 
 Scans = tuple[np.ndarray, np.ndarray]
@@ -46,7 +48,7 @@ def shaken(points: np.ndarray, seed: int) -> np.ndarray:
 def test_what_a_shape_does_not_determine_is_named(shape, said: set[str]) -> None:
     points = shape()
     source, target = (Surface(shaken(points, seed), 0.1) for seed in (0, 1))
-    info = observability.information(source, target, np.eye(4), np.zeros(3))
+    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
     weak = observability.undetermined(info, 2.0)
     assert len(weak) == len(said)
     kinds = sorted(w.split(" (")[0] for w in weak)
@@ -57,7 +59,7 @@ def test_what_a_shape_does_not_determine_is_named(shape, said: set[str]) -> None
 
 def test_a_room_determines_everything(room_scans: Scans) -> None:
     source, target = (Surface(s, EDGE) for s in room_scans)
-    info = observability.information(source, target, np.eye(4), np.zeros(3))
+    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
     assert info.shape == (6, 6)
     np.testing.assert_allclose(info, info.T, rtol=1e-9, atol=1e-9 * np.abs(info).max())
     assert np.linalg.eigvalsh(info).min() > 0
@@ -67,7 +69,30 @@ def test_a_room_determines_everything(room_scans: Scans) -> None:
 def test_more_noise_is_less_information() -> None:
     points = corridor()
     still, noisy = (
-        observability.information(Surface(points + n, 0.1), Surface(points, 0.1), np.eye(4), np.zeros(3))[2, 2]
+        observability.certainty(Surface(points + n, 0.1), Surface(points, 0.1), np.eye(4), np.zeros(3)).information
         for n in np.random.default_rng(0).normal(0, 1, (2, 1, *points.shape)).reshape(2, -1, 3) * [[[0.002]], [[0.02]]]
     )
-    assert still > 10 * noisy
+    assert still[2, 2] > 10 * noisy[2, 2]
+
+
+def test_the_covariance_is_that_of_the_error() -> None:
+    """Over many draws of one room's noise: the squared error of point-to-plane in its own deviations, 5.35 expected."""
+    rng = np.random.default_rng(5)
+    box = rng.uniform(-1, 1, (9000, 3))
+    box[np.arange(9000), rng.integers(0, 3, 9000)] = rng.choice([-1.0, 1.0], 9000)
+    box = box * [2, 1.5, 1]
+    squared = []
+    for _ in range(20):
+        source, target = (
+            Surface(box[rng.permutation(9000)[:6000]] + rng.normal(0, 0.01, (6000, 3)), 0.1) for _ in "ab"
+        )
+        T = np.eye(4)
+        for _ in range(4):
+            found = point_to_plane(
+                source.points, target.points, target.normals, target.tree, T, 0.15, np.zeros(3)
+            )  # fmt: skip
+            T = step_motion(-np.linalg.solve(found.A[:6, :6], found.b[:6])) @ T
+        twist = log(T)
+        covariance = observability.certainty(source, target, T, np.zeros(3)).covariance
+        squared.append(twist @ np.linalg.solve(covariance, twist))
+    assert 1.5 < np.median(squared) < 12

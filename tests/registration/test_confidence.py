@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration import confidence
+from fmr_cli.registration.agreement import agreement
 from fmr_cli.registration.pipeline import align
 
 
@@ -23,37 +26,85 @@ def pose(angle: float, shift: float) -> np.ndarray:
     return T
 
 
+def evidence(**given: float) -> confidence.Evidence:
+    """What a good pose of two rooms has, but for what is given."""
+    usual = {
+        "explained": 8000, "contradicted": 100, "overlap": 0.9, "explained_share": 0.8, "inlier_rmse": 0.01,
+        "offset": 0.7, "turn": 1.0, "stretch": 0.0, "votes": 200, "repeats": 0.15,
+    }  # fmt: skip
+    return confidence.Evidence(**(usual | given))  # type: ignore[arg-type]
+
+
+def said(*poses: confidence.Evidence) -> list[float]:
+    return confidence.confidences(np.array([e.vector() for e in poses]), confidence.bundled_weights())[0].tolist()
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_samples_of_one_surface_differ_as_neighbours_do_at_the_right_pose_alone(noise: float) -> None:
     rng = np.random.default_rng(0)
     source, target = (Surface(ball(rng, noise), 0.05) for _ in range(2))
-    right, shifted, turned = (confidence.fit(source, target, T) for T in (np.eye(4), pose(0, 0.05), pose(15, 0)))
-    assert right["overlap"] > 0.99
-    assert max(right["offset"], right["turn"]) < 1.2
-    assert min(shifted["offset"], turned["offset"]) > 1.3 * right["offset"]
+    right, shifted, turned = (agreement(source, target, T) for T in (np.eye(4), pose(0, 0.05), pose(15, 0)))
+    assert right.overlap > 0.99
+    assert max(right.offset, right.turn) < 1.2
+    assert min(shifted.offset, turned.offset) > 1.3 * right.offset
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_the_evidence_has_no_unit(unit: float) -> None:
     rng = np.random.default_rng(0)
     a, b = ball(rng, 0.01), ball(rng, 0.01)
-    here = confidence.fit(Surface(a, 0.05), Surface(b, 0.05), pose(10, 0.02))
-    there = confidence.fit(Surface(a * unit, 0.05 * unit), Surface(b * unit, 0.05 * unit), pose(10, 0.02 * unit))
-    for name, value in here.items():
-        assert there[name] == pytest.approx(value * (unit if name == "inlier_rmse" else 1), rel=1e-3)
+    here = agreement(Surface(a, 0.05), Surface(b, 0.05), pose(10, 0.02))
+    there = agreement(Surface(a * unit, 0.05 * unit), Surface(b * unit, 0.05 * unit), pose(10, 0.02 * unit))
+    for name, value in asdict(here).items():
+        assert getattr(there, name) == pytest.approx(value * (unit if name == "inlier_rmse" else 1), rel=2e-3, abs=1e-3)
 
 
 def test_nothing_in_reach_is_no_evidence() -> None:
     surface = Surface(ball(np.random.default_rng(0), 0), 0.05)
-    far = confidence.fit(surface, surface, pose(0, 9.0))
-    assert far["overlap"] == 0
-    assert far["offset"] == far["turn"] == 1
+    far = agreement(surface, surface, pose(0, 9.0))
+    assert far.overlap == far.explained == far.contradicted == 0
+    assert far.offset == far.turn == 1
 
 
-def test_poses_that_fit_as_well_share_the_confidence() -> None:
-    assert confidence.confidences([9.0]) == [pytest.approx(0.9)]
-    assert confidence.confidences([9.0, 0.0]) == [pytest.approx(0.9), 0]
-    assert confidence.confidences([9.0, 9.0]) == [pytest.approx(9 / 19)] * 2
+def test_a_surface_that_floats_over_another_contradicts_it() -> None:
+    rng = np.random.default_rng(0)
+    floor = rng.uniform(-1, 1, (8000, 3)) * [1, 1, 0]
+    table = rng.uniform(-0.3, 0.3, (2000, 3)) * [1, 1, 0] + [0, 0, 0.1]
+    bare, laid = Surface(floor, 0.05), Surface(np.concatenate([floor, table]), 0.05)
+    assert agreement(bare, bare, np.eye(4)).contradicted == 0
+    assert agreement(laid, bare, np.eye(4)).contradicted > 100
+
+
+def test_what_lies_beyond_the_border_of_a_scan_contradicts_nothing() -> None:
+    rng = np.random.default_rng(0)
+    wall = rng.uniform(0, 1, (20_000, 3)) * [2, 1, 0]
+    left, right = Surface(wall[wall[:, 0] < 1.2], 0.05), Surface(wall[wall[:, 0] > 0.8], 0.05)
+    assert agreement(left, right, np.eye(4)).contradicted == 0
+
+
+def test_a_source_of_another_scale_is_stretched() -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([ball(rng, 0), ball(rng, 0) * 0.4 + [0.9, 0.5, 0.3]])
+    here = agreement(Surface(points, 0.05), Surface(points[::-1], 0.05), np.eye(4))
+    grown = agreement(Surface(points * 1.04, 0.05), Surface(points, 0.05), np.eye(4))
+    assert here.stretch < 0.002
+    assert grown.stretch > 0.01
+
+
+def test_poses_that_fit_as_well_are_not_sure() -> None:
+    alone, junk = evidence(), evidence(explained=400, contradicted=900, offset=3.0, votes=4, explained_share=0.1)
+    assert said(alone)[0] >= confidence.ALIGNED
+    assert said(alone, junk)[0] >= confidence.ALIGNED
+    assert said(alone, alone)[0] < 0.6
+    assert sum(said(alone, alone, alone)) <= 1 + 1e-9
+
+
+@pytest.mark.parametrize("against", [
+    {"contradicted": 4000, "offset": 2.5}, {"stretch": 0.04, "offset": 2.0, "contradicted": 2000},
+    {"votes": 3, "explained": 500, "contradicted": 800, "offset": 3.0, "explained_share": 0.1},
+])  # fmt: skip
+def test_contradiction_outweighs_matches(against: dict[str, float]) -> None:
+    assert said(evidence(**against))[0] < 0.5
 
 
 def test_a_box_that_fits_turned_over_is_not_called_sure() -> None:
@@ -63,8 +114,9 @@ def test_a_box_that_fits_turned_over_is_not_called_sure() -> None:
     points[np.arange(12_000), rng.choice(3, 12_000, p=(1 / sides) / (1 / sides).sum())] = rng.choice([-1, 1], 12_000)
     points = points * sides
     found = align(PointCloud(points[::2]), PointCloud(transform_points(pose(70, 1), points[1::2])))
-    assert found.confidence < 0.6
-    assert found.alternatives or found.status == "uncertain"
+    assert found.status == "uncertain"
+    assert found.alternatives
+    assert any("fits about as well turned by 180 deg" in reason for reason in found.reasons)
 
 
 def test_a_sheet_is_found_by_its_outline() -> None:
