@@ -25,7 +25,7 @@ from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.registration.agreement import Agreement, agreement
 from fmr_cli.registration.pair import Pair
 
-ALIGNED = 0.8  # confidence from which a pose is called aligned: above what a person would check
+ALIGNED = 0.7  # confidence from which a pose is called aligned
 MOST_STRETCH = 0.05  # a stretch beyond it is as bad
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be right
