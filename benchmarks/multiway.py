@@ -5,8 +5,8 @@
     python -m benchmarks.multiway wrong --out /tmp/building        # its links, a tenth of them made wrong
 
 Scans are made once per --out and kept there, each turned by any rotation. Said of each run: scans placed, placed
-wrongly (over 5 deg or 0.1 m off), position errors of the pose graph alone and after the joint refinement (in the best
-common frame), the sigmas that were given, links, seconds, memory.
+wrongly (over 5 deg or 0.1 m off), position errors of the pose graph alone and after the joint refinement (about the
+best common frame), the sigmas that were given, links, seconds, memory.
 """
 
 from __future__ import annotations

@@ -200,7 +200,7 @@ def judged(survey: Survey, link: Link) -> Link:
         )
     elif link.status == "aligned":
         link = replace(link, status="rejected", message=said(link, "too much speaks against joining its components"))
-    if link.status == "rejected" and consistency.from_one_place(list(survey.links.values())):
+    if link.status == "rejected" and link.source in consistency.telling(list(survey.links.values())):
         share = link.hypotheses[0].seen_through
         if share > visibility.CONTRADICTED:
             link.message = said(link, f"one scan sees through {share:.1%} of the other there")

@@ -15,7 +15,7 @@ import numpy as np
 
 from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.looks import displacement
-from fmr_cli.multiway.visibility import CONTRADICTED, ONE_PLACE, doubt
+from fmr_cli.multiway.visibility import CONTRADICTED, ONE_PLACE, doubt, from_one_place
 
 AGREE = 4.0  # voxel edges, root mean square over a scan, that poses of one link or cycle may differ by
 CHANCE = 0.05  # that a wrong hypothesis agrees with another by accident, or since a place repeats itself
@@ -69,14 +69,10 @@ def log_odds(h: Hypothesis, one_place: bool) -> float:
     return float(np.clip(np.log(c / (1 - c)), -CERTAIN, CERTAIN)) - (doubt(h.seen_through) if one_place else 0.0)
 
 
-def from_one_place(links: list[Link]) -> bool:
-    """Whether scans were taken from one place each, so that what they see through tells: by each scan's best link."""
-    least: dict[int, float] = {}
-    for link in links:
-        if link.status == "aligned":
-            for end in link.ends:
-                least[end] = min(least.get(end, 1.0), link.hypotheses[0].seen_through)
-    return bool(least) and float(np.median(list(least.values()))) <= ONE_PLACE
+def telling(links: list[Link]) -> set[int]:
+    """The scans whose views tell right poses from wrong ones, by their links."""
+    seen = [(x.ends, x.hypotheses[0].seen_through) for x in links if x.status == "aligned" and x.hypotheses]
+    return from_one_place(seen, ONE_PLACE)
 
 
 def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
@@ -86,8 +82,8 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
         if link.hypotheses:
             by_scan[link.source][link.target].append(number)
             by_scan[link.target][link.source].append(number)
-    one_place = from_one_place(links)
-    alone = [[log_odds(h, one_place) for h in link.hypotheses] for link in links]
+    scans = telling(links)
+    alone = [[log_odds(h, link.source in scans) for h in link.hypotheses] for link in links]
     found = []
     for number, link in enumerate(links):
         i, j = link.ends
@@ -105,7 +101,7 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
                         agreed = np.where(off < reach, odds - np.log(CHANCE), 0.0)
                         best = max(best, float(agreed.max()))
                 support += best
-            contradicted = one_place and h.seen_through >= CONTRADICTED
+            contradicted = link.source in scans and h.seen_through >= CONTRADICTED
             found.append(Claim(number, choice, alone[number][choice] + min(support, CERTAIN), contradicted))
     return found
 

@@ -310,13 +310,10 @@ class Survey:
             return [self.seen_through(*pair, x.T_target_source) for x in promising]
 
         seen = dict(zip(pairs, self.each("comparing views", shares, pairs), strict=True))
-        least: dict[int, float] = {}
+        telling = visibility.from_one_place(((p, min(found)) for p, found in seen.items()), ROUGHLY_ONE_PLACE)
         for pair, found in seen.items():
-            for n in pair:
-                least[n] = min(least.get(n, 1.0), *found)
-        if not least or float(np.median(list(least.values()))) > ROUGHLY_ONE_PLACE:
-            return
-        for pair, found in seen.items():
+            if pair[0] not in telling:
+                continue
             look = self.looks[pair]
             factors = [1 / (1 + (share / ROUGHLY_CONTRADICTED) ** 2) for share in found]
             poses = zip((look, *look.others), factors, strict=False)

@@ -8,6 +8,7 @@ the scan hides another.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,6 +120,25 @@ def seen_through(scan: Viewed, by: Viewed, T_by_scan: np.ndarray) -> float:
     cell, distance = cells(points - by.viewpoint)
     through = ~near & (by.count[cell] >= SEEN) & (by.nearest[cell] > distance + APART * edge)
     return float(through.sum() / max((through | near).sum(), 1))
+
+
+def from_one_place(shares: Iterable[tuple[tuple[int, int], float]], bound: float) -> set[int]:
+    """The scans that were taken from one place each, so that what they see through tells.
+
+    shares: of pairs (i, j) that may be linked, what is seen through. Scans that such pairs connect are judged together:
+    each one's least share, in the median, is at most ``bound``; of scans fused from many places it is more.
+    """
+    least: dict[int, float] = {}
+    home: dict[int, int] = {}
+    for (i, j), share in shares:
+        for n in (i, j):
+            least[n] = min(least.get(n, 1.0), share)
+            home.setdefault(n, n)
+        a, b = home[i], home[j]
+        if a != b:
+            home = {n: a if h == b else h for n, h in home.items()}
+    groups = [[n for n in home if home[n] == g] for g in sorted(set(home.values()))]
+    return {n for g in groups if np.median([least[k] for k in g]) <= bound for n in g}
 
 
 def doubt(share: float) -> float:
