@@ -58,7 +58,7 @@ class PairRunner:
         options = replace(self.options, init=read_init(pair.init, self.folder)) if pair.init else self.options
         source, target = (self.cache.get(path, seed=self.options.seed) for path in self.files(pair))
         found = align(source, target, options, threads=1)
-        warnings = [*found.warnings, *self._write_clouds(pair, found.T_target_source)]
+        warnings = [*found.reasons, *found.warnings, *self._write_clouds(pair, found.T_target_source)]
         transform = f"transforms/{pair.name}.txt"
         write_transform(self.out / transform, found.T_target_source)
         return described(found) | {"transform": transform, "message": "; ".join(warnings)}

@@ -12,7 +12,8 @@ from fmr_cli.geometry.voxels import occupied_voxels
 
 THIN = 1e-3  # of the largest deviation: a scan that is thinner lies in a plane, rooms and streets do not
 CURVES = 2.8  # times as many voxels of half the edge: 2 on a curve, 4 where the plane is filled, as by a wall
-CELLS = 100.0  # edges in the largest deviation, at which that is counted
+FULL = 16.0  # points in a voxel, on the mean, at which that is counted: with fewer, chance empties voxels
+CELLS = 100.0  # edges in the largest deviation, at most
 HEIGHT = 0.3  # of the largest deviation, that the curves are raised to
 LAYERS, RAISED = 12, 60_000  # copies of each point, and how many points they may come to
 
@@ -24,7 +25,9 @@ def plane_of(points: np.ndarray) -> np.ndarray | None:
     deviation = np.sqrt(np.maximum(values, 0))
     if len(points) < 30 or deviation[0] > THIN * deviation[2] or deviation[1] <= THIN * deviation[2]:
         return None
-    edge = deviation[2] / CELLS * max(np.sqrt(5000 / len(some)), 1.0) * 4
+    edge = deviation[2]
+    while occupied_voxels(some, edge / 2) < len(some) / FULL and edge > deviation[2] / CELLS:
+        edge /= 2
     filled = occupied_voxels(some, edge / 2) > CURVES * occupied_voxels(some, edge)
     return None if filled else vectors[:, 0]
 

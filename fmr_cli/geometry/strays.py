@@ -106,7 +106,7 @@ def fitted_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
 def sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre (3,) and radius of the sphere through points (4, 3); 0 where they lie in one plane."""
     A = 2 * (points[1:] - points[0])
-    if abs(np.linalg.det(A)) < 1e-9 * np.prod(np.linalg.norm(A, axis=1)):
+    if abs(np.linalg.det(A)) <= 1e-9 * np.prod(np.linalg.norm(A, axis=1)):
         return points[0], 0.0
     centre = np.linalg.solve(A, (points[1:] ** 2).sum(1) - (points[0] ** 2).sum())
     return centre, float(np.linalg.norm(points[0] - centre))

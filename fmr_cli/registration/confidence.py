@@ -157,6 +157,9 @@ class Judge:
         """Gather the evidence at a pose, and weigh all candidates anew."""
         found = agreement(self.pair.s, self.pair.t, T_target_source)
         evidence = Evidence(**asdict(found), votes=self.pair.inlier_count(T_target_source), repeats=self.repeats)
+        known = next((c for c in self.candidates if self.pair.same(T_target_source, c.T_target_source)), None)
+        if known is not None:  # found again: where it came from first is where it comes from
+            start, errors = known.start, known.errors or errors
         new = Candidate(T_target_source, start, errors, evidence)
         kept: list[Candidate] = []
         for c in sorted([new, *self.candidates], key=lambda c: -c.evidence.merit):

@@ -146,8 +146,7 @@ def summary(source: PointCloud, target: PointCloud, found: Registration) -> list
         f"{found.status} (confidence {found.confidence:.2f}): rotation {found.angle:.4g} deg, shift {found.shift:.6g}, "
         f"{scale}overlap {found.overlap:.0%}, RMSE {found.inlier_rmse:.3g}, {found.seconds['total']:.2f} s"
     ]
-    if found.undetermined:
-        lines.append(f"the scans hardly determine: {'; '.join(found.undetermined)}")
+    lines += found.reasons
     if found.alternatives:
         lines.append(f"{len(found.alternatives)} other poses fit about as well: see alternatives in the metrics")
     for cloud in (source, target):

@@ -125,6 +125,7 @@ def from_given(judge: Judge, init: Any, time: Stopwatch) -> Judge:
         with time.stage("solve"):
             found = hypotheses.from_solver(pair, T, name)
         consider(judge, found, time)
+        judge.candidates = [c if c.errors else replace(c, errors=found[0].errors) for c in judge.candidates]
     if not judge.candidates:
         judge.consider(T, name, [])
     return judge

@@ -39,7 +39,8 @@ def test_it_returns_the_rows_of_its_file_and_tells_each(manifest, tmp_path):
         manifest, tmp_path / "out", on_row=lambda row, done, total: told.append((row["status"], done, total))
     )
     assert rows == table(tmp_path / "out")
-    assert told == [("aligned", 1, 4), ("failed", 2, 4), ("aligned", 3, 4), ("aligned", 4, 4)]
+    assert told == [(row["status"], number, 4) for number, row in enumerate(rows, 1)]
+    assert [row["status"] == "failed" for row in rows] == [False, True, False, False]
     assert not (tmp_path / "out" / "aligned").exists()
 
 

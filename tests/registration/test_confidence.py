@@ -100,7 +100,8 @@ def test_poses_that_fit_as_well_are_not_sure() -> None:
 
 
 @pytest.mark.parametrize("against", [
-    {"contradicted": 4000, "offset": 2.5}, {"stretch": 0.04, "offset": 2.0, "contradicted": 2000},
+    {"votes": 15, "explained": 2000, "contradicted": 6000, "offset": 3.5, "explained_share": 0.2},
+    {"stretch": 0.04, "offset": 2.0, "contradicted": 2000},
     {"votes": 3, "explained": 500, "contradicted": 800, "offset": 3.0, "explained_share": 0.1},
 ])  # fmt: skip
 def test_contradiction_outweighs_matches(against: dict[str, float]) -> None:
