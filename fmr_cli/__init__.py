@@ -7,8 +7,7 @@ Names are loaded on first use, so that ``import fmr_cli`` and ``fmr --help`` sta
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from fmr_cli.lazy import lazy
 
 __version__ = "0.1.0"
 
@@ -31,8 +30,4 @@ _HOME = {
 
 __all__ = ["__version__", *_HOME]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(_HOME[name]), name)
-    raise AttributeError(f"module 'fmr_cli' has no attribute {name!r}")
+__getattr__ = lazy(__name__, _HOME)

@@ -5,18 +5,13 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from fmr_cli.lazy import lazy
 
 _HOME = {
-    "align_batch": "pipeline",
-    "read_manifest": "manifest",
+    "align_batch": "fmr_cli.batch.pipeline",
+    "read_manifest": "fmr_cli.batch.manifest",
 }
 
 __all__ = [*_HOME]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"fmr_cli.batch.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'fmr_cli.batch' has no attribute {name!r}")
+__getattr__ = lazy(__name__, _HOME)

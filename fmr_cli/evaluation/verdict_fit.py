@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fmr_cli.evaluation.verdict_evidence import Judged
-from fmr_cli.registration.confidence import Weights, confidences, products, standing
+from fmr_cli.registration.confidence import Weights, confidences, products, sigmoid, standing
 
 RIDGE = 2e-3  # on the standardised weights of support and fit: next to nothing where the evidence decides
 PRODUCT_RIDGE = 3.0  # on those of the verdict, of as many observations: of 3, 10 and 30 the best on other pairs
@@ -29,7 +29,7 @@ def fit(evidence: Sequence[Judged]) -> Weights:
     first = Weights(support, quality, 0 * eleven, eleven, np.zeros(78))
     standings = [standing(j.x, first) for j in evidence]
     x = np.array([s for _, s in standings])
-    best = [int(np.argsort(-weigh, kind="stable")[0]) for weigh, _ in standings]
+    best = [int(weigh.argmax()) for weigh, _ in standings]
     right = np.array([j.right[i] for j, i in zip(evidence, best, strict=True)])
     known = Weights(support, quality, x.mean(0), x.std(0) + 1e-6, np.zeros(78))
     return Weights(support, quality, known.mean, known.std, logistic(products(x, known), right))
@@ -43,7 +43,7 @@ def fit_support(evidence: Sequence[Judged]) -> tuple[np.ndarray, np.ndarray]:
     spread, none = np.append(1.0, x[:, 1:].std(0) + TINY), np.bincount(pair, right) == 0
 
     def loss(w: np.ndarray) -> float:
-        s = 1 / (1 + np.exp(-np.clip(x @ (w[:9] / spread), -50, 50)))
+        s = sigmoid(x @ (w[:9] / spread))
         f = x[:, QUALITY] @ (w[9:] / spread[QUALITY])
         highest = np.full(len(evidence), -np.inf)
         np.maximum.at(highest, pair, f)
@@ -74,7 +74,7 @@ def judge(evidence: Sequence[Judged], weights: Weights) -> tuple[np.ndarray, np.
     said = []
     for j in evidence:
         shares, weigh = confidences(j.x, weights)
-        best = np.argsort(-weigh, kind="stable")[0]
+        best = int(weigh.argmax())
         said.append((shares[best], j.right[best]))
     confidence, right = zip(*said, strict=True)
     return np.array(confidence), np.array(right)

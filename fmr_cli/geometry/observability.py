@@ -39,8 +39,8 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     sandwich of cluster-robust regression, Liang and Zeger 1986): it holds however the residuals within a block hang
     together, be it by noise that voxels share or by a surface that is bent. Where the residuals' own optimum lies
     further from the pose than this covariance allows, it grows to what allows it (Birge's ratio). A misfit beyond
-    the surfaces' own roughness, as of scans that are bent or drifted, is the same over
-    large parts, of which there are BENDS.
+    the surfaces' own roughness, as of scans that are bent or drifted, is the same over large parts, of which
+    there are BENDS.
     """
     A, scores, misfits, sums = np.zeros((6, 6)), [], [], np.zeros(2)
     back = np.linalg.inv(T_target_source)
@@ -90,8 +90,13 @@ def undetermined(info: np.ndarray, length: float, basis: np.ndarray | None = Non
             continue
         omega, v = vector[:3], vector[3:]
         axis = omega if np.linalg.norm(omega) > np.linalg.norm(v) else v
-        axis = axis / np.linalg.norm(axis)
-        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-        where = "({:.2f}, {:.2f}, {:.2f})".format(*(np.round(axis, 2) + 0.0))  # no -0.00
-        said.append(f"rotation about {where}" if np.linalg.norm(omega) > np.linalg.norm(v) else f"shift along {where}")
+        kind = "rotation about" if np.linalg.norm(omega) > np.linalg.norm(v) else "shift along"
+        said.append(f"{kind} {direction(axis)}")
     return said
+
+
+def direction(v: np.ndarray) -> str:
+    """A direction (3,) in words, its largest component positive."""
+    v = v / max(float(np.linalg.norm(v)), 1e-300)
+    v = v * np.sign(v[np.argmax(np.abs(v))])
+    return "({:.2f}, {:.2f}, {:.2f})".format(*(np.round(v, 2) + 0.0))  # no -0.00

@@ -5,15 +5,14 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from fmr_cli.lazy import lazy
 
-_HOME = {"align_many": "pipeline", "Network": "network", "Known": "known"}
+_HOME = {
+    "align_many": "fmr_cli.multiway.pipeline",
+    "Network": "fmr_cli.multiway.network",
+    "Known": "fmr_cli.multiway.known",
+}
 
 __all__ = [*_HOME]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"fmr_cli.multiway.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'fmr_cli.multiway' has no attribute {name!r}")
+__getattr__ = lazy(__name__, _HOME)

@@ -88,7 +88,7 @@ def align_many(
     Raises FmrError where there are fewer than two scans, a name is unknown, or GTSAM is missing; a scan that cannot be
     read, or a pair that cannot be registered, is a row that says so.
     """
-    pose_graph.check_installed()
+    pose_graph.check_installed("fmr multiway")
     survey = Survey(list_scans(scans, out), options, known, out, workers or usable_cores(), progress)
     with survey.at_work(resume):
         survey.prepare()

@@ -53,10 +53,10 @@ class Solution:
     apart: list[np.ndarray | None]
 
 
-def check_installed() -> None:
-    """Raises FmrError where GTSAM is not installed."""
+def check_installed(what: str) -> None:
+    """Raises FmrError where GTSAM, which ``what`` needs, is not installed."""
     if importlib.util.find_spec("gtsam") is None:
-        raise FmrError("fmr multiway needs gtsam, which has no wheel for this platform; pip install gtsam from source")
+        raise FmrError(f"{what} needs gtsam, which has no wheel for this platform; pip install gtsam from source")
 
 
 def adjoint(T: np.ndarray) -> np.ndarray:

@@ -5,21 +5,16 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from fmr_cli.lazy import lazy
 
 _HOME = {
-    "align": "pipeline",
-    "prepare": "pipeline",
-    "Options": "options",
-    "Prepared": "prepared",
-    "Registration": "result",
+    "align": "fmr_cli.registration.pipeline",
+    "prepare": "fmr_cli.registration.pipeline",
+    "Options": "fmr_cli.registration.options",
+    "Prepared": "fmr_cli.registration.prepared",
+    "Registration": "fmr_cli.registration.result",
 }
 
 __all__ = [*_HOME]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"fmr_cli.registration.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'fmr_cli.registration' has no attribute {name!r}")
+__getattr__ = lazy(__name__, _HOME)

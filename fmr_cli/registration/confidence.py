@@ -13,7 +13,6 @@ on made-up scans that no test uses.
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
@@ -22,17 +21,20 @@ from importlib.resources import files
 import numpy as np
 
 from fmr_cli.cloud import angle_degrees, transform_points
+from fmr_cli.geometry.observability import direction
 from fmr_cli.registration.agreement import Agreement, agreement
 from fmr_cli.registration.pair import Pair
 
 ALIGNED = 0.7  # confidence from which a pose is called aligned
 MOST_STRETCH = 0.05  # a stretch beyond it is as bad
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
+LIKELY = 0.5  # support from which a pose would be called right if it were alone
 RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be right
 MARGIN = (-3.0, 6.0)  # of the margins over rivals: beyond, they say no more; the upper one also where there is no rival
 DEVIATIONS = 3.0  # of what the fit has seen: beyond, products of evidence would run away
-
-log = logging.getLogger(__name__)
+# From where on a kind of evidence is worth a word; they explain a verdict and do not make it.
+CONTRADICTED, STRETCHED, ROUGH, SMALL, FEW = 0.1, 0.005, 1.8, 0.2, 12
+TURNED = 5.0  # degrees: rivals turned by less are told by their shift
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,14 @@ def bundled_weights() -> Weights:
     return Weights(*(np.array(given[name]) for name in ("support", "fit", "mean", "std", "verdict")))
 
 
+def sigmoid(logit: np.ndarray) -> np.ndarray:
+    """The probability of a logit."""
+    return 1 / (1 + np.exp(-np.clip(logit, -SURE_LOGIT, SURE_LOGIT)))
+
+
 def support(x: np.ndarray, weights: Weights) -> np.ndarray:
     """The probability that poses with evidence x (n, 9) are right if they have no rival: (n,)."""
-    return 1 / (1 + np.exp(-np.clip(x @ weights.support, -SURE_LOGIT, SURE_LOGIT)))
+    return sigmoid(x @ weights.support)
 
 
 def standing(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
@@ -116,8 +123,8 @@ def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray
     what each weighs among the others. The first has what the verdict gives it, the others share the rest.
     """
     weigh, first = standing(x, weights)
-    p = float(1 / (1 + np.exp(-np.clip(products(first[None], weights)[0] @ weights.verdict, -SURE_LOGIT, SURE_LOGIT))))
-    best = int(np.argsort(-weigh, kind="stable")[0])
+    p = float(sigmoid(products(first[None], weights)[0] @ weights.verdict))
+    best = int(weigh.argmax())
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
     shares[best] = p
@@ -229,11 +236,6 @@ def doubts(pair: Pair, best: Candidate, rivals: Sequence[Candidate]) -> list[str
     return said
 
 
-# From where on a kind of evidence is worth a word; they explain a verdict and do not make it.
-CONTRADICTED, STRETCHED, ROUGH, SMALL, FEW = 0.1, 0.005, 1.8, 0.2, 12
-TURNED = 5.0  # degrees: rivals turned by less are told by their shift
-
-
 def in_words(pair: Pair, best: Candidate, rival: Candidate) -> str:
     """Where a rival puts the source, as seen from the best pose, in the target's axes."""
     motion = rival.T_target_source @ np.linalg.inv(best.T_target_source)
@@ -245,10 +247,3 @@ def in_words(pair: Pair, best: Candidate, rival: Candidate) -> str:
     centre = transform_points(best.T_target_source, pair.s.points.mean(0)[None])
     shift = (transform_points(motion, centre) - centre)[0]
     return f"shifted by {np.linalg.norm(shift):.3g} along {direction(shift)}"
-
-
-def direction(v: np.ndarray) -> str:
-    """A direction in words, its largest component positive."""
-    v = v / max(float(np.linalg.norm(v)), 1e-300)
-    v = v * np.sign(v[np.argmax(np.abs(v))])
-    return "({:.2f}, {:.2f}, {:.2f})".format(*(np.round(v, 2) + 0.0))  # no -0.00

@@ -41,11 +41,15 @@ class Hypothesis:
 
 def from_features(pair: Pair) -> list[Hypothesis]:
     """Matched local features and their spatial consensus: any rotation, part overlap."""
-    x, y = (keypoints / pair.edge for keypoints in pair.matches)
+    return [Hypothesis(T, "features", pair.overlap_score(T)) for T in agreed(pair, *pair.matches)[0]]
+
+
+def agreed(pair: Pair, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (n, 4, 4) that matches of source and target points x, y (C, 3) agree on, and how many do (n,)."""
     motion = Motion(pair.motion.dof, pair.motion.up, pair.motion.lift / pair.edge)
-    poses = consensus(x, y, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)[0]
+    poses, counts = consensus(x / pair.edge, y / pair.edge, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)
     poses[:, :3, 3] *= pair.edge
-    return [Hypothesis(T, "features", pair.overlap_score(T)) for T in poses]
+    return poses, counts
 
 
 def from_search(pair: Pair) -> list[Hypothesis]:
@@ -88,9 +92,7 @@ def rivals(pair: Pair, T_target_source: np.ndarray) -> tuple[list[Hypothesis], f
     x, y = runners_up(pair, T_target_source)
     if len(x) < RIVAL_MATCHES:
         return [], 0.0
-    motion = Motion(pair.motion.dof, pair.motion.up, pair.motion.lift / pair.edge)
-    poses, counts = consensus(x / pair.edge, y / pair.edge, CONSENSUS_TOLERANCE, CONSENSUS_POSES, motion)
-    poses[:, :3, 3] *= pair.edge
+    poses, counts = agreed(pair, x, y)
     behind = max(pair.inlier_count(T_target_source), 1)
     least = max(RIVAL_MATCHES, RIVAL_SHARE * behind)
     back = np.linalg.inv(T_target_source)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.descriptors.matching import match
-from fmr_cli.errors import FmrError, RegistrationError
+from fmr_cli.errors import RegistrationError
 from fmr_cli.feature_metric.inverse_compositional import Template
 from fmr_cli.geometry.frames import Frame, enter_frames, leave_frames
 from fmr_cli.geometry.motion import Motion
@@ -44,8 +44,6 @@ class Pair:
         self.encoder, self.local = fast_encoder(options.model), bundled_local_encoder()
         self.solver = solver(options.model, options.device)
         up = np.asarray(options.up, float)
-        if not np.isfinite(up).all() or np.linalg.norm(up) == 0:
-            raise FmrError(f"--up {options.up}: is no direction; give three numbers, not all zero")
         up /= np.linalg.norm(up)
         lift = float(up @ (source.centre - target.centre))  # what "planar" keeps of the shift between centred frames
         self.motion = Motion(options.dof, (float(up[0]), float(up[1]), float(up[2])), lift)

@@ -19,7 +19,7 @@ from threadpoolctl import ThreadpoolController
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, refinement
-from fmr_cli.registration.confidence import Judge
+from fmr_cli.registration.confidence import LIKELY, Judge
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -30,7 +30,6 @@ from fmr_cli.registration.units import unit_hint
 REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
-LIKELY = 0.5  # a pose less likely than that has no need of rivals
 FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
 FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000))  # the looks after it, while none is sure
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
@@ -148,7 +147,7 @@ def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch) -> None:
             if hypothesis.score >= WORTH * ranked[0].score and not judge.knows(hypothesis.T_target_source):
                 judge_refined(judge, hypothesis)
     with time.stage("rivals"):
-        if judge.candidates and judge.best.support >= LIKELY:
+        if judge.candidates and judge.best.support >= LIKELY:  # what is not has no need of rivals
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
             for hypothesis in rivals:

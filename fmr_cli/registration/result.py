@@ -16,12 +16,11 @@ import scipy
 import fmr_cli
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.geometry import observability
-from fmr_cli.registration.confidence import ALIGNED, Candidate, doubts
+from fmr_cli.registration.confidence import ALIGNED, LIKELY, Candidate, doubts
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair
 from fmr_cli.registration.prepared import Prepared
 
-LIKELY = 0.5  # support from which a pose would be called right if it were alone
 RIVALLING = 0.1  # of the best one's weight, that an alternative has at least
 
 

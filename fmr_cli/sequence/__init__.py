@@ -5,21 +5,16 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from fmr_cli.lazy import lazy
 
 _HOME = {
-    "align_sequence": "pipeline",
-    "SequenceOptions": "options",
-    "SequenceResult": "result",
-    "Scans": "scans",
-    "find_scans": "scans",
+    "align_sequence": "fmr_cli.sequence.pipeline",
+    "SequenceOptions": "fmr_cli.sequence.options",
+    "SequenceResult": "fmr_cli.sequence.result",
+    "Scans": "fmr_cli.sequence.scans",
+    "find_scans": "fmr_cli.sequence.scans",
 }
 
 __all__ = [*_HOME]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"fmr_cli.sequence.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'fmr_cli.sequence' has no attribute {name!r}")
+__getattr__ = lazy(__name__, _HOME)

@@ -5,14 +5,12 @@ Lengths are in voxels and poses are T_map_scan, as in ``odometry``.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from fmr_cli.errors import FmrError
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, LocalMap, displacement
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
@@ -35,12 +33,6 @@ class Loop:
     earlier: int
     later: int
     T_earlier_later: np.ndarray
-
-
-def check_installed() -> None:
-    """Raises FmrError where GTSAM is not installed."""
-    if importlib.util.find_spec("gtsam") is None:
-        raise FmrError("--loop-closure needs gtsam: pip install 'fmr-cli[loops]'")
 
 
 def close_loops(

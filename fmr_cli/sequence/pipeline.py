@@ -17,10 +17,11 @@ import numpy as np
 import fmr_cli
 from fmr_cli.cloud import PointCloud, angle_degrees
 from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
+from fmr_cli.multiway.pose_graph import check_installed
 from fmr_cli.sequence.deskew import scan_times
 from fmr_cli.sequence.journal import Beginning, Journal
 from fmr_cli.sequence.loader import Loader
-from fmr_cli.sequence.loop_closure import check_installed, close_loops
+from fmr_cli.sequence.loop_closure import close_loops
 from fmr_cli.sequence.odometry import Frame, Odometry
 from fmr_cli.sequence.options import SequenceOptions
 from fmr_cli.sequence.outputs import Outputs
@@ -85,7 +86,7 @@ def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool
     if options.camera_frame and scans.T_camera_scan is None:
         raise FmrError(f"{scans.where(0)}: no calib.txt with a line Tr beside it, leave out --camera-frame")
     if options.loop_closure:
-        check_installed()
+        check_installed("--loop-closure")
     if resume and (out is None or any(scans.path(i) is None for i in range(len(scans)))):
         raise FmrError("resume needs a file of poses, and scans in files; leave it out")
 

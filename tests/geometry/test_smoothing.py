@@ -1,0 +1,27 @@
+"""Roughness tells noise from shape, and points put onto their planes lie nearer to the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fmr_cli.geometry.smoothing import local_planes, roughness
+
+
+def ball(noise: float) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    v = rng.normal(size=(6000, 3))
+    return v / np.linalg.norm(v, axis=1, keepdims=True) + rng.normal(0, noise, (6000, 3))
+
+
+def test_noise_is_rough_and_a_curved_surface_is_not() -> None:
+    assert roughness(ball(0.0)) < 0.05
+    assert roughness(ball(0.05)) > 0.15
+
+
+def test_points_come_nearer_to_the_surface() -> None:
+    noisy = ball(0.03)
+    put, normals, _ = local_planes(noisy, cKDTree(noisy), 30)
+    off = [np.abs(np.linalg.norm(points, axis=1) - 1).mean() for points in (noisy, put)]
+    assert off[1] < 0.5 * off[0]
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
