@@ -1,0 +1,111 @@
+"""What mkdocs does not do by itself: the command reference from the commands, quoted figures, equations as MathML."""
+
+from __future__ import annotations
+
+import html
+import re
+from typing import Any
+
+import click
+from latex2mathml.converter import convert
+from typer.main import get_command
+
+from fmr_cli.cli.app import app
+from fmr_cli.evaluation.quoted import QUOTED
+
+MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fills in what is made from the code: ``<!-- commands -->``, ``<!-- quoted: KITTI -->``."""
+    markdown = markdown.replace("<!-- commands -->", commands())
+    return re.sub(r"<!-- quoted: (.*?) -->", lambda found: quoted(found[1]), markdown)
+
+
+def on_page_content(page: str, **_: Any) -> str:
+    """Equations as MathML, which browsers show without a script."""
+
+    def mathml(found: re.Match[str]) -> str:
+        return convert(html.unescape(found[2]).strip(), display="block" if found[1] == "div" else "inline")
+
+    return MATH.sub(mathml, page)
+
+
+def commands() -> str:
+    """A section for each command: what it is for, its arguments, its options by their groups."""
+    group = get_command(app)
+    assert isinstance(group, click.Group) or hasattr(group, "commands")
+    return "\n\n".join(section(name, command) for name, command in group.commands.items())  # type: ignore[attr-defined]
+
+
+def section(name: str, command: Any) -> str:
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    options = [p for p in command.params if p.param_type_name == "option"]
+    usage = " ".join([f"fmr {name}", *(shown(argument) for argument in arguments), "[OPTIONS]"])
+    parts = [f"## fmr {name}", f"```text\n{usage}\n```", inspected(command.help)]
+    if arguments:
+        parts.append(
+            "\n".join(["| argument | |", "| --- | --- |", *(row(f"`{a.name.upper()}`", a) for a in arguments)])
+        )
+    groups: dict[str, list[Any]] = {}
+    for option in options:
+        groups.setdefault(getattr(option, "rich_help_panel", None) or "Options", []).append(option)
+    for title, members in groups.items():
+        head = [f"| {'option' if title == 'Options' else title.lower()} | | default |", "| --- | --- | --- |"]
+        parts.append("\n".join([*head, *(row(names(o), o, default(o)) for o in members)]))
+    return "\n\n".join(parts)
+
+
+def shown(argument: Any) -> str:
+    name = argument.name.upper() + ("..." if argument.nargs == -1 else "")
+    return name if argument.required else f"[{name}]"
+
+
+def inspected(text: str) -> str:
+    """A command's docstring as Markdown paragraphs."""
+    return "\n".join(line.strip() for line in (text or "").strip().splitlines())
+
+
+def names(option: Any) -> str:
+    """`-o`, `--out PATH`."""
+    value = (
+        ""
+        if option.is_flag or getattr(option, "count", False)
+        else f" {option.make_metavar(click.Context(click.Command('fmr')))}"
+    )
+    all_names = [*option.opts, *option.secondary_opts]
+    return ", ".join(f"`{n}`" for n in all_names[:-1]) + (", " if all_names[1:] else "") + f"`{all_names[-1]}{value}`"
+
+
+def default(option: Any) -> str:
+    if option.required:
+        return "required"
+    if isinstance(option.show_default, str):
+        return option.show_default
+    value = option.default
+    if (
+        value is None
+        or value is False
+        or callable(value)
+        or option.show_default is False
+        or value == 0
+        and option.is_flag
+    ):
+        return ""
+    if value is True:
+        return f"`{option.opts[0]}`"
+    return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+
+
+def row(name: str, parameter: Any, *more: str) -> str:
+    help_ = " ".join((parameter.help or "").split()).replace("|", "\\|")
+    return "| " + " | ".join([name.replace("|", "\\|"), help_, *(text.replace("|", "\\|") for text in more)]) + " |"
+
+
+def quoted(dataset: str) -> str:
+    """What others published on a data set, with where it stands."""
+    lines = ["| method | recall % | RRE deg | RTE m | quoted from |", "| --- | --- | --- | --- | --- |"]
+    for q in (q for q in QUOTED if q.dataset == dataset):
+        figures = ["" if value is None else f"{value:g}" for value in (q.recall, q.rre, q.rte)]
+        lines.append(f"| {q.method} | {' | '.join(figures)} | {q.source} |")
+    return "\n".join(lines)
