@@ -1,11 +1,12 @@
 # make demo: environment, install, and two sample scans registered. make test: lint, types and tests, and what was skipped.
-# Both make .venv from nothing but Python 3.11 or later (on Debian: apt install python3-venv); again, they are quick.
+# make docs: the documentation, into site/; a broken link fails it.
+# All make .venv from nothing but Python 3.11 or later (on Debian: apt install python3-venv); again, they are quick.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
 WORKERS ?= auto # of pytest; a test process takes about 0.7 GB
 
-.PHONY: demo test coverage clean
+.PHONY: demo test coverage docs clean
 
 demo: .venv/installed
 	mkdir -p demo
@@ -22,6 +23,9 @@ test: .venv/installed-for-tests
 coverage: .venv/installed-for-tests
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --cov --cov-report=term-missing:skip-covered
 
+docs: .venv/installed-for-docs
+	$(BIN)/mkdocs build --strict
+
 .venv/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(INSTALL) .
@@ -29,8 +33,12 @@ coverage: .venv/installed-for-tests
 
 # Every extra: no test is skipped for want of a package.
 .venv/installed-for-tests: .venv/installed
-	$(INSTALL) '.[eval,e57,baselines,dev]'
+	$(INSTALL) '.[eval,e57,baselines,docs,dev]'
+	touch $@
+
+.venv/installed-for-docs: .venv/installed
+	$(INSTALL) '.[docs]'
 	touch $@
 
 clean:
-	rm -rf .venv demo build dist *.egg-info
+	rm -rf .venv demo site build dist *.egg-info

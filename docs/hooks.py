@@ -2,39 +2,41 @@
 
 from __future__ import annotations
 
+import csv
 import html
 import re
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
-import click
 from latex2mathml.converter import convert
 from typer.main import get_command
 
 from fmr_cli.cli.app import app
 from fmr_cli.evaluation.quoted import QUOTED
 
+RESULTS = Path(__file__).parent / "results" / "paper.csv"
 MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fills in what is made from the code: ``<!-- commands -->``, ``<!-- quoted: KITTI -->``."""
+    """Fills in what is made from the code: ``<!-- commands -->``, ``<!-- experiment: noise -->``, ..."""
     markdown = markdown.replace("<!-- commands -->", commands())
+    markdown = re.sub(r"<!-- experiment: (.*?) -->", lambda found: experiment(found[1]), markdown)
     return re.sub(r"<!-- quoted: (.*?) -->", lambda found: quoted(found[1]), markdown)
 
 
-def on_page_content(page: str, **_: Any) -> str:
+def on_page_content(content: str, **_: Any) -> str:
     """Equations as MathML, which browsers show without a script."""
 
     def mathml(found: re.Match[str]) -> str:
         return convert(html.unescape(found[2]).strip(), display="block" if found[1] == "div" else "inline")
 
-    return MATH.sub(mathml, page)
+    return MATH.sub(mathml, content)
 
 
 def commands() -> str:
     """A section for each command: what it is for, its arguments, its options by their groups."""
     group = get_command(app)
-    assert isinstance(group, click.Group) or hasattr(group, "commands")
     return "\n\n".join(section(name, command) for name, command in group.commands.items())  # type: ignore[attr-defined]
 
 
@@ -68,13 +70,20 @@ def inspected(text: str) -> str:
 
 def names(option: Any) -> str:
     """`-o`, `--out PATH`."""
-    value = (
-        ""
-        if option.is_flag or getattr(option, "count", False)
-        else f" {option.make_metavar(click.Context(click.Command('fmr')))}"
-    )
-    all_names = [*option.opts, *option.secondary_opts]
-    return ", ".join(f"`{n}`" for n in all_names[:-1]) + (", " if all_names[1:] else "") + f"`{all_names[-1]}{value}`"
+    flags = [*option.opts, *option.secondary_opts]
+    if not option.is_flag and not getattr(option, "count", False):
+        flags[-1] += " " + kind(option.type_descriptor.annotation)
+    return ", ".join(f"`{flag}`" for flag in flags)
+
+
+def kind(annotation: Any) -> str:
+    """What an option takes, in a word: NUMBER, PATH, one|two."""
+    parts = [part for part in get_args(annotation) if part is not type(None)]
+    if parts and all(isinstance(part, str) for part in parts):
+        return "|".join(parts)
+    if parts:  # of an optional, a list, three numbers
+        return " ".join(kind(part) for part in parts)
+    return {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}.get(annotation, "VALUE")
 
 
 def default(option: Any) -> str:
@@ -88,8 +97,7 @@ def default(option: Any) -> str:
         or value is False
         or callable(value)
         or option.show_default is False
-        or value == 0
-        and option.is_flag
+        or (value == 0 and option.is_flag)
     ):
         return ""
     if value is True:
@@ -108,4 +116,17 @@ def quoted(dataset: str) -> str:
     for q in (q for q in QUOTED if q.dataset == dataset):
         figures = ["" if value is None else f"{value:g}" for value in (q.recall, q.rre, q.rte)]
         lines.append(f"| {q.method} | {' | '.join(figures)} | {q.source} |")
+    return "\n".join(lines)
+
+
+def experiment(name: str) -> str:
+    """One of the paper's experiments, from the results.csv of `fmr evaluate` beside the page: methods by level."""
+    with RESULTS.open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["experiment"] == name]
+    levels = list(dict.fromkeys(row["level"] for row in rows))
+    lines = [f"| | {' | '.join(f'{float(level):g}' for level in levels)} |", "| --- " * (len(levels) + 1) + "|"]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        own = {row["level"]: row for row in rows if row["method"] == method}
+        cells = [f"{float(own[x]['success']):.2f} ({float(own[x]['rotation_mean']):.1f})" for x in levels]
+        lines.append(f"| {method} | {' | '.join(cells)} |")
     return "\n".join(lines)

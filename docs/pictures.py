@@ -8,17 +8,19 @@ from collections.abc import Callable
 from importlib.resources import as_file, files
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from fmr_cli import align, read_cloud
+from fmr_cli import align, align_many, read_cloud, read_transform
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.evaluation.heldout import Setting, draw, errors
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.solver import make_template, solve
 from fmr_cli.registration.models import bundled_encoder, load_encoder
-from fmr_cli.synthetic.examples import write_pair
+from fmr_cli.synthetic.batches import Pairs
+from fmr_cli.synthetic.examples import write_building
 from fmr_cli.synthetic.shapes import others
 
 FOLDER = Path(__file__).parent / "pictures"
@@ -27,48 +29,54 @@ SEED = 0
 
 
 def hero() -> Figure:
-    """The example's two scans, each in its own frame; and merged by the transform that was found."""
+    """Two scans of the example building, each in its own frame; and merged by the transform that was found."""
     with tempfile.TemporaryDirectory() as folder:
-        a, b = (read_cloud(path).points for path in write_pair(Path(folder), 2, SEED))
+        paths = write_building(Path(folder), 2, SEED)
+        b, a = (read_cloud(path).points for path in paths)
+        T_world_b = read_transform(paths[0].with_suffix(".pose.txt"))
     found = align(PointCloud(a), PointCloud(b))
-    up = upright(b)
-    figure = Figure((12, 4.6), layout="constrained")
-    views = (
-        ("source", [(a @ upright(a).T, SOURCE)]),
-        ("target", [(b @ up.T, TARGET)]),
-        (
-            f"{found.status}, confidence {found.confidence:.2f}: turned by {found.angle:.0f} deg",
-            [(b @ up.T, TARGET), (transform_points(found.T_target_source, a) @ up.T, SOURCE)],
-        ),
-    )
-    for number, (title, clouds) in enumerate(views):
-        axis = figure.add_subplot(1, 3, number + 1, projection="3d")
-        for cloud, colour in clouds:
-            low, high = np.quantile(cloud[:, 2], [0.01, 0.99])
-            inside = cloud[(cloud[:, 2] < high - 0.15 * (high - low))]  # without the ceiling
-            axis.scatter(*inside.T, s=0.25, color=colour, linewidths=0, alpha=0.8)
-        if number == 0:
-            turned = np.random.default_rng(4).normal(size=3)
-            axis.view_init(elev=25 + 20 * turned[0], azim=60 * turned[1], roll=40)
-        else:
-            axis.view_init(elev=48, azim=-60)
-        axis.set(title=title, box_aspect=np.ptp(np.concatenate([c for c, _ in clouds]), axis=0))
-        axis.set_axis_off()
+    figure = Figure((12, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for axis, cloud, colour, name in ((axes[0], a, SOURCE, "source"), (axes[1], b, TARGET, "target")):
+        axis.scatter(*cloud[:, :2].T, s=0.6, color=colour, linewidths=0)
+        axis.set(title=f"{name}, as its scanner saw it")
+    # From above, at the height of the furniture; the target's true pose only says where up is.
+    for cloud, colour in ((b, TARGET), (transform_points(found.T_target_source, a), SOURCE)):
+        world = transform_points(T_world_b, cloud)
+        level = world[(world[:, 2] > 0.15) & (world[:, 2] < 2.5)]
+        axes[2].scatter(*level[:, :2].T, s=1.5, color=colour, linewidths=0, alpha=0.6)
+    x, y = T_world_b[:2, 3]
+    axes[2].set(
+        title=f"{found.status}, confidence {found.confidence:.2f}, seen from above",
+        xlim=(x - 5.5, x + 5.5), ylim=(y - 4, y + 5.5),
+    )  # fmt: skip
+    for axis in axes:
+        axis.set(aspect="equal", xticks=[], yticks=[])
+        axis.set_frame_on(False)
     return figure
 
 
-def upright(points: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that makes the direction with the sharpest layers (floor, ceiling) the vertical."""
-    from scipy.spatial.transform import Rotation
-
-    best, chosen = -np.inf, np.array([0.0, 0, 1])
-    for axis in Rotation.random(3000, random_state=0).apply([0, 0, 1]):
-        h = np.histogram(points @ axis, bins=80)[0]
-        if (h**2).sum() > best:
-            best, chosen = float((h**2).sum()), axis
-    if np.median(points @ chosen) > np.mean(np.quantile(points @ chosen, [0.01, 0.99])):
-        chosen = -chosen
-    return Rotation.align_vectors([[0, 0, 1]], chosen[None])[0].as_matrix()
+def building() -> Figure:
+    """The example building from above: every scan where `fmr multiway` puts it, a colour each."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = write_building(Path(folder), 20, SEED)
+        network = align_many(paths)
+        clouds = [read_cloud(path).points for path in paths]
+        true = [read_transform(path.with_suffix(".pose.txt")) for path in paths]
+    placed = [
+        (scan, cloud, T) for scan, cloud, T in zip(network.scans, clouds, true, strict=True) if scan.component == 0
+    ]
+    up = placed[0][2] @ np.linalg.inv(placed[0][0].T_component_scan)  # only says where up is
+    figure = Figure((7, 7), layout="constrained")
+    axis = figure.subplots()
+    colours = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, len(placed)))
+    for (scan, cloud, _), colour in zip(placed, colours, strict=True):
+        world = transform_points(up @ scan.T_component_scan, cloud)
+        level = world[(world[:, 2] > 0.15) & (world[:, 2] < 2.5)]
+        axis.scatter(*level[:, :2].T, s=0.3, color=colour, linewidths=0)
+    axis.set(aspect="equal", xticks=[], yticks=[], title=f"{len(placed)} of {len(clouds)} scans in one frame")
+    axis.set_frame_on(False)
+    return figure
 
 
 def anchors() -> Figure:
@@ -107,9 +115,7 @@ def convergence() -> Figure:
     for axis, overlap in zip(axes, (1.0, 0.9, 0.8), strict=True):
         pairs = draw(pool, Setting("", (40, 40), overlap=overlap), 24, 512, SEED)
         for robust, label, colour in ((False, "the paper's", "#edae49"), (True, "robust, both Jacobians", TARGET)):
-            axis.plot(
-                range(11), [median_error(encoder, pairs, k, robust) for k in range(11)], "o-", color=colour, label=label
-            )
+            axis.plot(error_by_iteration(encoder, pairs, 10, robust), "o-", color=colour, label=label)
         axis.axhline(5, color="0.7", linestyle=":")
         axis.set(title=f"{overlap:.0%} overlap", xlabel="iteration", yscale="log")
     axes[0].set_ylabel("median rotation error, deg")
@@ -118,15 +124,17 @@ def convergence() -> Figure:
 
 
 @torch.inference_mode()
-def median_error(encoder: Encoder, pairs, iterations: int, robust: bool) -> float:  # noqa: ANN001
-    start = torch.eye(4).repeat(len(pairs), 1, 1)
-    if iterations == 0:
-        return errors(start, pairs.truth).median
-    found = solve(encoder, make_template(encoder, pairs.target), pairs.source, start, iterations, robust)
-    return errors(found.g, pairs.truth).median
+def error_by_iteration(encoder: Encoder, pairs: Pairs, iterations: int, robust: bool) -> list[float]:
+    """The median rotation error before the first step and after each one."""
+    template, g = make_template(encoder, pairs.target), torch.eye(4).repeat(len(pairs), 1, 1)
+    found = [errors(g, pairs.truth).median]
+    for _ in range(iterations):  # a step does not depend on how many follow
+        g = solve(encoder, template, pairs.source, g, 1, robust).g
+        found.append(errors(g, pairs.truth).median)
+    return found
 
 
-PICTURES: dict[str, Callable[[], Figure]] = {"hero": hero, "anchors": anchors, "convergence": convergence}
+PICTURES: dict[str, Callable[[], Figure]] = {f.__name__: f for f in (hero, building, anchors, convergence)}
 
 
 def main() -> None:

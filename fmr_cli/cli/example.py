@@ -14,11 +14,13 @@ from fmr_cli.errors import FmrError
 
 def example_command(
     kind: Annotated[
-        Literal["pair", "building", "drive"],
-        typer.Argument(help="Two scans of a room, a building's, or a LiDAR's along a street.", show_default=False),
+        Literal["pair", "building", "drive", "objects"],
+        typer.Argument(
+            help="Two scans of a room, a building's, a LiDAR's along a street; or whole objects.", show_default=False
+        ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The folder to make.", show_default=False)],
-    scans: Annotated[int | None, typer.Option(help="How many.", min=2, show_default="2, 20 or 60")] = None,
+    scans: Annotated[int | None, typer.Option(help="How many.", min=2, show_default="2, 20, 60 or 10")] = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same scans.", min=0)] = 0,
     quiet: Quiet = False,
 ) -> None:

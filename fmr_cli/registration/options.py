@@ -1,4 +1,4 @@
-"""How to register: the one list of options. The command line, its help and the README's table are made from it."""
+"""How to register: the one list of options. The command line, its help and the documentation are made from it."""
 
 # ruff: noqa: RUF009 (`option` makes a field, no shared default)
 # No `from __future__ import annotations` here: the command line and the checks read the fields' types.

@@ -28,17 +28,20 @@ def number(value: float | None, form: str) -> str:
 
 
 def table(dataset: DataSet, measured: Sequence[Summary], quoted: Sequence[Quoted]) -> Table:
-    """What was measured here, a line, and what others published, with where it stands."""
-    shown = Table("method", "recall %", "RRE deg", "RTE", "aligned: right", "share", "s a pair", "from")
+    """What was measured here, a line a method; then what others published, with where it stands below."""
+    shown = Table("method", "recall %", "RRE deg", "RTE", "precision", "aligned", "s a pair", "", title_justify="left")
+    shown.columns[0].no_wrap = True
     shown.title = f"{dataset.name}: {len(dataset.pairs)} pairs; right: {dataset.right.text}"
     for row in measured:
         verdict = [number(100 * x, ".1f") for x in (row.precision, row.share)]
         shown.add_row(row.method, number(100 * row.recall, ".1f"), number(row.rre, ".3f"), number(row.rte, ".4f"),
-                      *verdict, number(row.seconds, ".3f"), "measured")  # fmt: skip
+                      *verdict, number(row.seconds, ".3f"))  # fmt: skip
     shown.add_section()
+    sources = list(dict.fromkeys(other.source for other in quoted))
     for other in quoted:
         shown.add_row(other.method, number(other.recall, ".1f"), number(other.rre, ".3f"), number(other.rte, ".4f"),
-                      "", "", "", f"quoted: {other.source}", style="dim")  # fmt: skip
+                      "", "", "", f"quoted [{sources.index(other.source) + 1}]", style="dim")  # fmt: skip
+    shown.caption = "\n".join(f"[{n}] {source}" for n, source in enumerate(sources, 1)) or None
     return shown
 
 

@@ -1,4 +1,4 @@
-"""Example scans with their truth, to try things on: two scans of a room, a building, a drive along a street; metres.
+"""Example scans with their truth, to try things on: two scans of a room, a building, a drive along a street; objects.
 
 Each writes a folder that the commands take as it is, and that `fmr evaluate` recognises.
 """
@@ -16,11 +16,13 @@ from fmr_cli.io import write_cloud, write_poses, write_transform
 from fmr_cli.synthetic import scenes
 from fmr_cli.synthetic.building import building, terrestrial
 from fmr_cli.synthetic.sensors import terrestrial_scan
+from fmr_cli.synthetic.shapes import others
 
 NOISE = 0.003  # m, of the room's scans
 STEP = 1.0  # m between the scans of the drive: 36 km/h at 10 Hz
 LENGTH = 160.0  # m of street: more than a drive may be long
 BEAMS, COLUMNS, REACH = 32, 720, 60.0  # of the drive's scanner; m
+OBJECT_POINTS = 8192
 
 
 def write_pair(folder: Path, scans: int, seed: int) -> list[Path]:
@@ -97,6 +99,15 @@ def write_drive(folder: Path, scans: int, seed: int) -> list[Path]:
     return written
 
 
+def write_objects(folder: Path, scans: int, seed: int) -> list[Path]:
+    """object_00.ply, ...: whole objects of kinds that no bundled network was trained on; no truth, for experiments."""
+    written = []
+    for number, points in enumerate(others(scans, OBJECT_POINTS, seed)):
+        written.append(folder / f"object_{number:02d}.ply")
+        write_cloud(written[-1], PointCloud(points.astype(float)))
+    return written
+
+
 def own_frame(eye: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """T_scan_world (4, 4) of a scanner at eye (3,): the origin at the scanner, the axes turned at random."""
     T = np.eye(4)
@@ -110,4 +121,5 @@ EXAMPLES: dict[str, tuple[Callable[[Path, int, int], list[Path]], int, int]] = {
     "pair": (write_pair, 2, 26),
     "building": (write_building, 20, 40),
     "drive": (write_drive, 60, 120),
+    "objects": (write_objects, 10, 100),
 }

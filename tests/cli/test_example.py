@@ -46,6 +46,12 @@ def test_a_drive_is_kittis(tmp_path, fmr_here):
     assert (pair.source, pair.target) == ("000000", "000009")  # 1.01 m a step along a curve
 
 
+def test_objects_are_for_experiments(tmp_path, fmr_here):
+    fmr_here("example", "objects", "--scans", "3", "-o", tmp_path / "o", "-q")
+    assert len(read_cloud(tmp_path / "o/object_02.ply")) == 8192
+    assert recognised([tmp_path / "o"]) is None
+
+
 def test_the_same_seed_gives_the_same_scans(tmp_path, fmr_here):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         fmr_here("example", "pair", "-o", tmp_path / name, "--seed", seed, "-q")

@@ -1,4 +1,4 @@
-"""The options of a registration on the command line: those of ``Options``, in the README too, refused on one line."""
+"""The options of a registration on the command line: those of ``Options``, refused on one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import pytest
 from fmr_cli.cli.options import takes_registration_options
 from fmr_cli.registration.options import Options, choices, flag
 
-README = Path(__file__).parents[2] / "README.md"
 
 
 def test_the_defaults_are_the_librarys():
@@ -74,16 +73,3 @@ def test_an_unknown_word_names_the_choices(fmr_here, name, known):
     done = fmr_here("align", "a.ply", "b.ply", f"--{name}", "other")
     assert done.returncode == 2
     assert known in done.stderr
-
-
-def readme_row(f: Field) -> str:
-    """The option's line in the README's table."""
-    name = flag(f.name) + (f"/--no-{f.name}" if f.default is True else "")
-    name += {"init": " auto", "up": " X Y Z"}.get(f.name, "")
-    words = "|".join(["--[a-z-]+", *(rf"(?<![\w-]){word}(?![\w-])" for word in choices(f))])
-    return f"| `{name}` | {re.sub(words, lambda found: f'`{found[0]}`', f.metadata['help'])} |"
-
-
-def test_the_readme_lists_them():
-    table = "\n".join(map(readme_row, fields(Options)))
-    assert table in README.read_text("utf-8"), f"put this table into README.md:\n{table}"
