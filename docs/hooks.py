@@ -77,10 +77,10 @@ def names(option: Any) -> str:
 
 
 def kind(annotation: Any) -> str:
-    """What an option takes, in a word: NUMBER, PATH, one|two."""
+    """What an option takes, in a word: NUMBER, PATH, one/two."""
     parts = [part for part in get_args(annotation) if part is not type(None)]
     if parts and all(isinstance(part, str) for part in parts):
-        return "|".join(parts)
+        return "/".join(parts)
     if parts:  # of an optional, a list, three numbers
         return " ".join(kind(part) for part in parts)
     return {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}.get(annotation, "VALUE")
@@ -91,18 +91,11 @@ def default(option: Any) -> str:
         return "required"
     if isinstance(option.show_default, str):
         return option.show_default
-    value = option.default
-    if (
-        value is None
-        or value is False
-        or callable(value)
-        or option.show_default is False
-        or (value == 0 and option.is_flag)
-    ):
+    if option.show_default is False or option.count or option.default in (None, False) or callable(option.default):
         return ""
-    if value is True:
-        return f"`{option.opts[0]}`"
-    return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+    if option.default is True:
+        return "yes"
+    return " ".join(map(str, option.default)) if isinstance(option.default, tuple) else str(option.default)
 
 
 def row(name: str, parameter: Any, *more: str) -> str:
