@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import html
+import itertools
 import re
 from pathlib import Path
 from typing import Any, get_args
@@ -14,7 +15,8 @@ from typer.main import get_command
 from fmr_cli.cli.app import app
 from fmr_cli.evaluation.quoted import QUOTED
 
-RESULTS = Path(__file__).parent / "results" / "paper.csv"
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results" / "paper.csv"
 MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
@@ -22,6 +24,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fills in what is made from the code: ``<!-- commands -->``, ``<!-- experiment: noise -->``, ..."""
     markdown = markdown.replace("<!-- commands -->", commands())
     markdown = re.sub(r"<!-- experiment: (.*?) -->", lambda found: experiment(found[1]), markdown)
+    markdown = markdown.replace("<!-- calibration -->", calibration())
     return re.sub(r"<!-- quoted: (.*?) -->", lambda found: quoted(found[1]), markdown)
 
 
@@ -123,3 +126,10 @@ def experiment(name: str) -> str:
         cells = [f"{float(own[x]['success']):.2f} ({float(own[x]['rotation_mean']):.1f})" for x in levels]
         lines.append(f"| {method} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def calibration() -> str:
+    """The table of the verdict's card: how often poses of each confidence were right."""
+    lines = (ROOT / "models" / "README.md").read_text("utf-8").splitlines()
+    first = next(n for n, line in enumerate(lines) if line.startswith("| confidence |"))
+    return "\n".join(itertools.takewhile(lambda line: line.startswith("|"), lines[first:]))
