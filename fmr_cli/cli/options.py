@@ -21,10 +21,19 @@ Verbose = Annotated[
 Debug = Annotated[bool, typer.Option("--debug", help="Where an error comes from, as a traceback.")]
 BinColumns = Annotated[
     str | None,
+    typer.Option(help="What a .bin holds, such as x,y,z,intensity,ring:u2 (float32 without a type)."),
+]
+
+Bounds = Annotated[
+    tuple[float, float, float, float, float, float] | None,
     typer.Option(
-        help="What a .bin holds, such as x,y,z,intensity,ring:u2 (float32 without a type); told by the values if not given."
+        metavar="X Y Z X Y Z", help="Only what lies between two corners, low and high; of a COPC nothing else is read."
     ),
 ]
+Resolution = Annotated[
+    float | None, typer.Option(help="Of a COPC: the spacing of points that is enough, in the file's unit.")
+]
+Topic = Annotated[str | None, typer.Option(help="Of a bag: the topic of its point clouds, where it has several.")]
 
 
 def columns(given: str | None) -> tuple[str, ...] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -68,11 +68,21 @@ def open_cloud(
     seed: int = 0,
     attributes: bool = True,
     bin_columns: tuple[str, ...] | None = None,
+    bounds: Sequence[float] | None = None,
+    resolution: float | None = None,
+    topic: str | None = None,
+    enough: int | None = None,
 ) -> CloudStream:
-    """A point cloud to be read a chunk at a time; nothing is read yet, but the file is there. As `read_cloud`."""
+    """A point cloud to be read a chunk at a time; nothing is read yet, but the file is there. As `read_cloud`.
+
+    enough: a reader that can (COPC) may stop at so many points that are spread evenly.
+    """
     module, kind, file, part = find_module(Path(path), SUFFIXES)
     check_readable(file)
-    wanted = Wanted(attributes, part, bin_columns)
+    box = checked_bounds(bounds)
+    if resolution is not None and module.__name__ != "fmr_cli.io.las":
+        raise CloudFileError(f"{path}: has no levels, --resolution needs a COPC (.copc.laz)")
+    wanted = Wanted(attributes, part, bin_columns, box, resolution, enough, topic)
 
     def chunks() -> Iterator[PointCloud]:
         points = dropped = 0
@@ -86,9 +96,14 @@ def open_cloud(
             bad = int(len(finite) - finite.sum())
             if bad:
                 cloud = cloud.select(finite)
+            if box is not None:
+                inside = (cloud.points >= np.array(box[:3])) & (cloud.points <= np.array(box[3:]))
+                cloud = cloud.select(np.flatnonzero(inside.all(axis=1)))
             cloud.path, cloud.format, cloud.dropped = Path(path), form, cloud.dropped + bad
             points, dropped = points + len(cloud), dropped + bad
             yield cloud
+        if points == 0 and box is not None:
+            raise CloudFileError(f"{path}: has no points within the bounds, compare them with `fmr info`")
         if points == 0:
             what = f"none of its {dropped} points has finite coordinates" if dropped else "holds no points"
             raise CloudFileError(f"{path}: {what}, check how it was written")
@@ -104,6 +119,8 @@ def read_cloud(
     attributes: bool = True,
     at_most: int | None = None,
     bin_columns: tuple[str, ...] | None = None,
+    bounds: Sequence[float] | None = None,
+    resolution: float | None = None,
 ) -> PointCloud:
     """Reads a point cloud; points with NaN or infinite coordinates are dropped and counted in ``dropped``.
 
@@ -112,17 +129,29 @@ def read_cloud(
         least 10,000 and at most 1,000,000. 0 gives the vertices themselves. ``seed`` makes the sample repeatable.
     attributes: False leaves everything but the coordinates in the file, which saves time and memory.
     at_most: of more than twice as many points, at least so many are kept, spread evenly; ``total`` says how many there
-        are. The memory it takes then depends on this number only.
-    bin_columns: what the numbers of a .bin are, where their values do not tell.
+        are. The memory it takes then depends on this number only. Of a COPC only the coarse levels are read.
+    bin_columns: what the numbers of a .bin are, where their values do not tell: names, or "name:type" of numpy.
+    bounds: low x y z and high x y z, in the file's unit: only what lies within. Of a COPC nothing else is read.
+    resolution: of a COPC, the spacing of points that is enough, in the file's unit.
 
     Raises CloudFileError, one line that names the file, for whatever is wrong with it.
     """
-    cloud = collect(
-        open_cloud(path, mesh_points=mesh_points, seed=seed, attributes=attributes, bin_columns=bin_columns),
-        at_most,
-        seed,
-    )
-    return cloud
+    stream = open_cloud(
+        path, mesh_points=mesh_points, seed=seed, attributes=attributes, bin_columns=bin_columns, bounds=bounds,
+        resolution=resolution, enough=at_most,
+    )  # fmt: skip
+    return collect(stream, at_most, seed)
+
+
+def checked_bounds(bounds: Sequence[float] | None) -> tuple[float, ...] | None:
+    """Six numbers, low before high. Raises CloudFileError."""
+    if bounds is None:
+        return None
+    box = tuple(float(v) for v in bounds)
+    if len(box) != 6 or not all(low <= high for low, high in zip(box[:3], box[3:], strict=True)):
+        said = " ".join(f"{v:g}" for v in box)
+        raise CloudFileError(f"--bounds {said}: give low x y z and then high x y z, each low below its high")
+    return box
 
 
 def scans_of(path: str | Path) -> list[ScanPart]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io.fields import are_colors, bare_names, lost_context
+from fmr_cli.io.fields import are_colors, bare_names, lost_context, native
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted
 
 WIDTHS = range(3, 9)  # numbers a point
@@ -59,7 +59,7 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
             rows = np.fromfile(file, dtype, CHUNK)
             points = np.stack([rows[axis] for axis in "xyz"], 1)
             names = [name for name in dtype.names or () if name not in "xyz"]
-            kept = {name: rows[name].copy() for name in names} if wanted.attributes else {}
+            kept = {name: native(rows[name]) for name in names} if wanted.attributes else {}
             yield PointCloud(points, kept, sensor_origin=np.zeros(3), layout=layout)
 
 
@@ -79,11 +79,12 @@ def find_columns(path: Path, size: int) -> tuple[str, ...] | None:
     two layouts do.
     """
     sample = sample_of(path, size, "<f4")
-    if plausible(sample):
+    wholes = [] if plausible(sample) and np.isnan(sample).mean() < 0.1 else whole_numbers_among(sample, size)
+    if plausible(sample) and not wholes:
         return columns_of(sample, size, "")
     if size % NCLT.itemsize == 0 and is_nclt(path):
         return None
-    found = [*whole_numbers_among(sample, size), *(c for c in PACKED if is_packed(path, size, c))]
+    found = [*wholes, *(c for c in PACKED if is_packed(path, size, c))]
     if not found and size % 8 == 0 and plausible(doubles := sample_of(path, size, "<f8")):
         return columns_of(doubles, size, ":f8")
     if len(found) > 1:
@@ -105,9 +106,9 @@ def whole_numbers_among(sample: np.ndarray, size: int) -> list[tuple[str, ...]]:
         if size % (4 * width) or any(width % len(columns) == 0 for columns in found):
             continue
         rows = sample[: len(sample) // width * width].reshape(-1, width)
-        share = np.array([(~is_plausible(column)).mean() for column in rows.T])
-        whole = share > 0.8
-        if whole.any() and not whole[:3].any() and (share[~whole] < 0.02).all() and (np.ptp(rows[:, :3], 0) > 0).all():
+        whole = np.array([(~is_plausible(column)).mean() > 0.8 for column in rows.T])
+        floats = all(plausible(column) for column in rows.T[~whole])
+        if whole.any() and not whole[:3].any() and floats and (np.ptp(rows[:, :3], axis=0) > 0).all():
             values = np.where(whole, np.ascontiguousarray(rows).view("<u4"), rows.astype(np.float64))
             names = name_columns(values[:, 3:])
             kinds = [":u4" if w else "" for w in whole[3:]]
@@ -135,14 +136,15 @@ def sample_of(path: Path, size: int, kind: str) -> np.ndarray:
 
 
 def is_plausible(values: np.ndarray) -> np.ndarray:
-    """Which numbers may be those of a scan: neither huge nor tiny; NaN may be, for a point without a return."""
+    """Which numbers may be those of a scan: neither huge nor tiny."""
     magnitude = np.abs(values)
-    return (magnitude == 0) | ((magnitude > PLAUSIBLE[0]) & (magnitude < PLAUSIBLE[1])) | np.isnan(values)
+    return (magnitude == 0) | ((magnitude > PLAUSIBLE[0]) & (magnitude < PLAUSIBLE[1]))
 
 
 def plausible(sample: np.ndarray) -> bool:
-    """Whether the numbers are those of a scan, but for a few."""
-    return bool(is_plausible(sample).mean() > 0.98) if len(sample) else True
+    """Whether the numbers are those of a scan, but for a few; those that are not finite, of no return, do not count."""
+    finite = sample[np.isfinite(sample)]
+    return bool(is_plausible(finite).mean() > 0.98) if len(finite) else True
 
 
 def columns_of(sample: np.ndarray, size: int, kind: str) -> tuple[str, ...]:
@@ -190,7 +192,7 @@ def column_information(sample: np.ndarray, width: int) -> float:
 
 
 def name_columns(extra: np.ndarray) -> list[str]:
-    """What the numbers after x y z are: an intensity first, small integers a ring, what rises a time; colours, normals."""
+    """What the numbers after x y z are: intensity first, small integers a ring, what rises a time; colours, normals."""
     count = extra.shape[1]
     names = bare_names(extra) if count >= 3 else []
     if names and not names[0].startswith("column_"):

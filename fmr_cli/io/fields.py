@@ -126,7 +126,7 @@ def parted(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
 
 def native(values: np.ndarray) -> np.ndarray:
     """A contiguous copy in this machine's byte order."""
-    return np.array(values, dtype=values.dtype.newbyteorder("="))
+    return values.astype(values.dtype.newbyteorder("="))
 
 
 def bare_names(extra: np.ndarray) -> list[str]:

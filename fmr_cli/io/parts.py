@@ -30,3 +30,10 @@ def choose(parts: list[ScanPart], wanted: str | None) -> list[int]:
     names = ", ".join(part.name for part in parts[:20])
     what = f"has {len(named)} scans called {wanted!r}, give its number" if named else f"has no scan {wanted!r}"
     raise CloudFileError(f"{what}; there are {len(parts)}: {names}")
+
+
+def proper(T_file_scan: np.ndarray | None) -> np.ndarray:
+    """The pose (4, 4) as one that does not mirror, which the points then do: files know rotations only."""
+    T = np.eye(4) if T_file_scan is None else T_file_scan.copy()
+    T[:3, :3] *= np.sign(np.linalg.det(T[:3, :3]))
+    return T

@@ -212,7 +212,8 @@ def parse_slowly(rows: Rows, dtype: np.dtype, dialect: Dialect) -> np.ndarray:
             if isinstance(error, CloudFileError):
                 raise
             if "\0" in line:
-                raise CloudFileError(f"line {number}: holds zero bytes, it was not written to its end: copy it again")
+                what = "holds zero bytes, it was not written to its end: copy it again"
+                raise CloudFileError(f"line {number}: {what}") from None
             text = line.strip()[:60]
             bad = next((c.strip() for c in (cells[i] for i in dialect.used if i < len(cells))
                         if THOUSANDS.fullmatch(c.strip().strip('"'))), None)  # fmt: skip

@@ -206,7 +206,7 @@ def blanks_part(cell: str) -> bool:
 
 
 def decimals_between_commas(lines: list[str]) -> bool:
-    """Whether lines such as 101,870,-3,050 are numbers with decimal commas: every other cell is digits, some 0 first."""
+    """Whether lines such as 101,870,-3,050 have decimal commas: every other cell is digits, some with a 0 first."""
     cells = [[cell.strip() for cell in line.rstrip("\n").split(",")] for line in lines]
     if any(len(row) < 6 or len(row) % 2 for row in cells):
         return False
