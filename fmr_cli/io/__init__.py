@@ -14,7 +14,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
-from fmr_cli.io.parts import ScanPart
+from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name
 from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
 from fmr_cli.vectors import unturned
@@ -33,16 +33,19 @@ FORMATS = {
     ".pts": ("text", "pts"),
     ".ptx": ("ptx", "ptx"),
     ".e57": ("e57", "e57"),
+    ".bag": ("bags", "bag"),
+    ".mcap": ("bags", "bag"),
+    ".db3": ("bags", "bag"),
     ".npy": ("numpy_files", "npy"),
     ".npz": ("numpy_files", "npz"),
     ".off": ("mesh", "mesh"),
     ".obj": ("mesh", "mesh"),
     ".stl": ("mesh", "mesh"),
 }
-PARTED = ("e57", "ptx")  # modules whose files may hold several scans
+PARTED = ("e57", "ptx", "bags")  # modules whose files may hold several scans
 PACKED = tuple(f"{suffix}.gz" for suffix, (module, _) in FORMATS.items() if module == "text")
 SUFFIXES = (*FORMATS, *PACKED)
-WRITABLE = tuple(suffix for suffix, (module, _) in FORMATS.items() if module not in ("mesh",))
+WRITABLE = tuple(suffix for suffix, (module, _) in FORMATS.items() if module not in ("mesh", "bags"))
 
 __all__ = [
     "SUFFIXES",
@@ -53,6 +56,7 @@ __all__ = [
     "read_cloud",
     "read_poses",
     "read_transform",
+    "scan_paths",
     "scans_of",
     "transform_text",
     "write_cloud",
@@ -78,7 +82,8 @@ def open_cloud(
     enough: a reader that can (COPC) may stop at so many points that are spread evenly.
     """
     module, kind, file, part = find_module(Path(path), SUFFIXES)
-    check_readable(file)
+    if not is_bag_folder(file):
+        check_readable(file)
     box = checked_bounds(bounds)
     if resolution is not None and module.__name__ != "fmr_cli.io.las":
         raise CloudFileError(f"{path}: has no levels, --resolution needs a COPC (.copc.laz)")
@@ -154,18 +159,36 @@ def checked_bounds(bounds: Sequence[float] | None) -> tuple[float, ...] | None:
     return box
 
 
-def scans_of(path: str | Path) -> list[ScanPart]:
+def scans_of(path: str | Path, topic: str | None = None) -> list[ScanPart]:
     """The scans of a file with their names and poses; of most formats one, in the file's own frame.
 
-    Its name is then empty. Each but that is read by ``FILE#number``, numbers from 1. Raises CloudFileError.
+    Its name is then empty. Each but that is read by ``FILE#number``, numbers from 1, see ``scan_paths``. topic: of a
+    bag. Raises CloudFileError.
     """
     path = Path(path)
     module, _, file, part = find_module(path, SUFFIXES)
     if module.__name__.rsplit(".", 1)[1] not in PARTED or part is not None:
         return [ScanPart("", np.eye(4), 0)]
-    check_readable(file)
+    if not is_bag_folder(file):
+        check_readable(file)
     with naming(file):
-        return module.scans(file)
+        return module.scans(file, topic) if topic is not None else module.scans(file)
+
+
+def scan_paths(path: str | Path, topic: str | None = None) -> list[Path]:
+    """What to read each scan of a file by: FILE#1, FILE#2, ... of a file that holds several, else the file itself."""
+    path = Path(path)
+    parts = scans_of(path, topic)
+    if len(parts) == 1 and not parts[0].name:
+        return [path]
+    return [path.with_name(f"{path.name}#{part_name(number, topic)}") for number in range(1, len(parts) + 1)]
+
+
+def holds_scans(path: str | Path) -> bool:
+    """Whether a path is of a kind that may hold several scans: a bag, an E57, a PTX."""
+    path = Path(path)
+    known = FORMATS.get(path.suffix.lower())
+    return is_bag_folder(path) or (path.is_file() and known is not None and known[0] in PARTED)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
@@ -226,6 +249,8 @@ def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str,
     if "#" in path.name and suffixes is SUFFIXES and not path.exists():
         name, part = path.name.rsplit("#", 1)
         path = path.with_name(name)
+    if suffixes is SUFFIXES and is_bag_folder(path):
+        return importlib.import_module("fmr_cli.io.bags"), "bag", path, part
     packed = path.suffix.lower() == ".gz"
     suffix = path.with_suffix("").suffix.lower() if packed else path.suffix.lower()
     full = f"{suffix}.gz" if packed else suffix
