@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.io.files import check_readable
+from fmr_cli.io.folders import natural, stem, times_by_name
 from fmr_cli.io.transforms import as_transform, number_rows
 
 TEXT = {".txt", ".csv"}  # beside scans of another format these are poses, times, tables
@@ -97,7 +97,9 @@ def find_scans(
         what = f"{len(files)} scans, {len(chosen)} of them chosen" if len(chosen) < len(files) else "one scan only"
         raise CloudFileError(f"{path}: {what}, a sequence has two or more (formats: {' '.join(SUFFIXES)})")
     times = read_times(home, len(files)) if path.is_dir() else None
-    times = None if times is None else times[np.array(chosen)]
+    if times is None:
+        times = times_by_name([stem(file) for file in files])
+    times = None if times is None else in_order(times[np.array(chosen)], [files[i] for i in chosen], notes)
     return Scans([files[i] for i in chosen], chosen, len(files), times, read_calibration(home), notes)
 
 
@@ -112,7 +114,19 @@ def in_folder(folder: Path, outputs: set[Path], notes: list[str]) -> list[Path]:
     if len(count) > 1:
         others = ", ".join(f"{n} {s}" for s, n in sorted(count.items()) if s != suffix)
         notes.append(f"{folder}: two formats, the {count[suffix]} {suffix} files are taken, {others} left out")
-    return sorted((p for p in found if p.suffix.lower() == suffix), key=natural)
+    return sorted((p for p in found if p.suffix.lower() == suffix), key=lambda file: natural(stem(file)))
+
+
+def in_order(times: np.ndarray, files: list[Path], notes: list[str]) -> np.ndarray | None:
+    """The times (n,), or None where they run to and fro: then they say nothing about the motion between scans."""
+    back = np.flatnonzero(~(np.diff(times) >= 0) != ~(times[-1] >= times[0]))
+    if len(back):
+        notes.append(
+            f"{files[back[0] + 1]}: time runs the other way there than from the first scan to the last, so the times "
+            "are not used; check the order of the scans"
+        )
+        return None
+    return times
 
 
 def in_list(path: Path) -> list[Path]:
@@ -128,11 +142,6 @@ def in_list(path: Path) -> list[Path]:
         what = f"lists {missing}, which is not there" if missing else "lists no scans"
         raise CloudFileError(f"{path}: {what}, name one scan file a line")
     return files
-
-
-def natural(path: Path) -> list[tuple[int, int | str]]:
-    """A key that puts 2.ply before 10.ply."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"([0-9]+)", path.name) if part]
 
 
 def read_times(home: Path, count: int) -> np.ndarray | None:
