@@ -25,7 +25,7 @@ class Scans:
 
     sources: files, or clouds in memory; ``chosen`` are their places among all ``total``. times: (n,), one a scan,
     seconds, or None. T_camera_scan: (4, 4), calib.txt's Tr, or None. notes: what a person should know about the choice,
-    a line each.
+    a line each. every: all the files, where only some are chosen.
     """
 
     sources: list[Path | PointCloud]
@@ -34,6 +34,12 @@ class Scans:
     times: np.ndarray | None = None
     T_camera_scan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+    every: list[Path] = field(default_factory=list)
+
+    @property
+    def all_sources(self) -> list[Path | PointCloud]:
+        """Those of all ``total`` scans."""
+        return list(self.every) or self.sources
 
     def __len__(self) -> int:
         return len(self.sources)
@@ -52,6 +58,13 @@ class Scans:
         """One scan. Raises CloudFileError."""
         source = self.sources[index]
         return source if isinstance(source, PointCloud) else read_cloud(source, attributes=attributes)
+
+    def pace(self, index: int) -> float:
+        """The time from the scan before to this one, over that before it; 1 where it is not known."""
+        if self.times is None or index < 2:
+            return 1.0
+        before, after = np.diff(self.times[index - 2 : index + 1])
+        return float(after / before) if before else 1.0
 
     def where(self, index: int) -> str:
         """The scan's path, or what stands for it in a message."""
@@ -100,7 +113,7 @@ def find_scans(
     if times is None:
         times = times_by_name([stem(file) for file in files])
     times = None if times is None else in_order(times[np.array(chosen)], [files[i] for i in chosen], notes)
-    return Scans([files[i] for i in chosen], chosen, len(files), times, read_calibration(home), notes)
+    return Scans([files[i] for i in chosen], chosen, len(files), times, read_calibration(home), notes, files)
 
 
 def in_folder(folder: Path, outputs: set[Path], notes: list[str]) -> list[Path]:
