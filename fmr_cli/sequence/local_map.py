@@ -43,7 +43,7 @@ class Fit:
     overlap: the share of the scan's points that have a counterpart on the map. cost: their mean squared distance over
     the local variance, halved. start: the initial guess it came from. rms: distance of those points from the map's
     planes, voxels, NaN before ``LocalMap.polish``; seen: which directions are observed, None before it, and where too
-    few points lie on planes to tell.
+    few points lie on planes to tell. verified: the registration onto the scan before has shown that it is right.
     """
 
     T_map_scan: np.ndarray
@@ -52,6 +52,7 @@ class Fit:
     start: str
     rms: float = float("nan")
     seen: Observability | None = None
+    verified: bool = False
 
     @property
     def total(self) -> float:
@@ -102,7 +103,7 @@ class LocalMap:
 
     def _add(self, keyframe: Keyframe) -> None:
         scan, T_map_scan = keyframe.scan, keyframe.T_map_scan
-        points, normals, cloud = scan.points, scan.normals, scan.cloud
+        points, normals, cloud = scan.points[scan.solid], scan.normals[scan.solid], scan.cloud
         if self.known:
             new = self.known.beyond(transform_points(T_map_scan, points))
             if new.sum() < MIN_POINTS:
@@ -136,7 +137,7 @@ class LocalMap:
         slope: how residuals grow with range, see ``plane_map.trust``.
         """
         T_map_scan, rms, slope, matches = self.planes.fit(
-            scan.points, scan.normals, scan.ranges, fit.T_map_scan, slope
+            scan.points, scan.normals, scan.ranges, scan.solid, fit.T_map_scan, slope
         )  # fmt: skip
         seen = self._seen(scan, T_map_scan, matches) if matches else None
         return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms, seen=seen), slope

@@ -11,16 +11,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fmr_cli.errors import RegistrationError
 from fmr_cli.sequence.known_map import KnownMap
-from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
+from fmr_cli.sequence.local_map import COARSE, FINE, REACH, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
+
+if TYPE_CHECKING:
+    from fmr_cli.registration import Registration
 
 # The constants without a reference are set by hand on the drives of the tests (a simulated street; HDL-64 and Kinect
 # sequences): whole numbers and halves, none of them tuned to a decimal.
@@ -45,7 +48,6 @@ FINEST = 0.05
 MATTERS = 0.5
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
-
 
 FeatureErrors = tuple[float, float] | None
 
@@ -139,12 +141,14 @@ class Odometry:
         return Frame(self.frame.pose_to_file(T_map_scan), "aligned", 1.0, 0.0, "first")
 
     def _best_fit(self, scan: PreparedScan, next_frame: Expected) -> tuple[Fit, FeatureErrors]:
-        """Trust the prediction while predictions have been good; else compare starts by what they come to."""
+        """Trust the prediction while predictions have been good; else compare starts by what they come to.
+
+        Where none fits the map, the registration onto the scan before counts, if its verdict is "aligned".
+        """
         T_map_predicted, expected = next_frame.T_map_scan, EXPECTED_ERROR * max(self.errors, default=np.inf)
         fits = []
         if self.aligned > TRUSTED_AFTER:
-            edges = (FINE,) if expected < FINE else (COARSE, FINE)
-            fit = self.map.fit(scan, T_map_predicted, edges, "prediction")
+            fit = self.map.fit(scan, T_map_predicted, levels(expected), "prediction")
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
                 return fit, None
             fits = [fit]
@@ -157,21 +161,26 @@ class Odometry:
         same = all(displacement(fit.T_map_scan, best.T_map_scan, scan.points) < FINE / 2 for fit in fits)
         if self._fits(best) and ((len(fits) > 1 and same) or best.total < CONVINCING):
             return best, None
-        T_map_features, feature_errors = self._feature_start(scan)
+        found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
-        return min(best, by_features, key=lambda fit: fit.total), feature_errors
+        best = min(best, by_features, key=lambda fit: fit.total)
+        if not self._fits(best) and found.status == "aligned":
+            same = displacement(by_features.T_map_scan, T_map_features, scan.points) < FINE
+            best = by_features if same else replace(by_features, T_map_scan=T_map_features)
+            best = replace(best, verified=True)
+        return best, (found.feature_error_before, found.feature_error_after)
 
-    def _feature_start(self, scan: PreparedScan) -> tuple[np.ndarray, FeatureErrors]:
-        """Where feature-metric registration puts the scan, by the last one that could be used."""
+    def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
+        """The registration onto the last scan that could be used, and where that puts the scan in the map."""
         from fmr_cli.registration import Options, align
 
         _, last, T_map_last = self.last
-        found = align(scan.for_align, last.for_align, Options(refine=False))
-        return T_map_last @ found.T_target_source, (found.feature_error_before, found.feature_error_after)
+        found = align(scan.for_align, last.for_align, Options(init="features"))
+        return found, T_map_last @ found.T_target_source
 
     def _fits(self, fit: Fit) -> bool:
         usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
-        return fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST
+        return fit.verified or (fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST)
 
     def _usual(self, fit: Fit) -> bool:
         """Whether the fit is as good as the last ones; a scanner's rings on the ground hold it where it was, too."""
@@ -293,3 +302,10 @@ class Odometry:
         for index in state["map"]:
             self.map.insert(index, load(index), T_map_scan[index])
         self.last = (state["last"], load(state["last"]), T_map_scan[state["last"]])
+
+
+def levels(expected: float) -> tuple[float, ...]:
+    """The map's levels from which a pose is reached that the prediction misses by so many voxels, coarse to fine."""
+    if expected < FINE:
+        return (FINE,)
+    return (COARSE, FINE) if expected < COARSE * REACH else (WIDE, COARSE, FINE)

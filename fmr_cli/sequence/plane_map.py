@@ -53,9 +53,15 @@ class PlaneMap:
         self.tree = None
 
     def fit(
-        self, points: np.ndarray, normals: np.ndarray, ranges: np.ndarray, T: np.ndarray, slope: float
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        ranges: np.ndarray,
+        solid: np.ndarray,
+        T: np.ndarray,
+        slope: float,
     ) -> tuple[np.ndarray, float, float, Matches | None]:
-        """The pose near T of points with unit normals (N, 3), seen at ranges (N,).
+        """The pose near T of points with unit normals (N, 3), seen at ranges (N,), whose normals are right where solid (N,).
 
         slope: how residuals grow with range in this sensor's scans, see ``trust``. Returns the pose, the RMS distance
         from the planes, this scan's own slope, and what was matched; T as it was, NaN and None where too few points lie
@@ -74,7 +80,7 @@ class PlaneMap:
         for _ in range(ROUNDS):
             found, squared = self.tree.batch_nearest_neighbor_search(transform_points(T, points))
             plane = np.array(found)
-            on = (np.array(squared) < REACH**2) & self.flat[plane]
+            on = solid & (np.array(squared) < REACH**2) & self.flat[plane]
             cosine = np.einsum("ij,ij->i", self.normals[plane], normals @ T[:3, :3].T)
             on &= (np.abs(cosine) if self.two_sided else cosine) > AGREE
             if on.sum() < 6 * BANDS:
