@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import platform
+import socket
 import sys
 import time
 import uuid
@@ -53,7 +54,9 @@ class DaskWorkers:
         self, address: Any, count: int | None = None, say: Callable[[str], None] = logging.getLogger(__name__).warning
     ) -> None:
         self.address, self.wanted, self.say = address, count, say
-        self.name = address if isinstance(address, str) else "the Dask client"
+        if isinstance(address, str) and address != "local" and "://" not in address:
+            self.address = f"tcp://{address}"
+        self.name = self.address if isinstance(address, str) else "the Dask client"
         self.fit: dict[str, int] = {}  # threads of each worker that can be used
         self.asked: dict[str, Any] = {}  # what each new worker has, once it answers
         self.refused: dict[str, str] = {}  # and why
@@ -72,18 +75,19 @@ class DaskWorkers:
     def __enter__(self) -> DaskWorkers:
         distributed = library()
         quiet(distributed)
-        try:
-            if isinstance(self.address, distributed.Client):
-                self.client = self.address
-            elif self.address == "local":
-                self.cluster = distributed.LocalCluster(
-                    n_workers=self.wanted or usable_cores(), threads_per_worker=1, dashboard_address="127.0.0.1:0",
-                )  # fmt: skip
-                self.client = distributed.Client(self.cluster, timeout=CONNECT, set_as_default=False)
-            else:
+        if isinstance(self.address, distributed.Client):
+            self.client = self.address
+        elif self.address == "local":
+            self.cluster = distributed.LocalCluster(
+                n_workers=self.wanted or usable_cores(), threads_per_worker=1, dashboard_address="127.0.0.1:0",
+            )  # fmt: skip
+            self.client = distributed.Client(self.cluster, timeout=CONNECT, set_as_default=False)
+        else:
+            check_address(self.address)
+            try:
                 self.client = distributed.Client(self.address, timeout=CONNECT, set_as_default=False)
-        except (OSError, ValueError, TypeError, RuntimeError) as error:
-            raise FmrError(unreachable(self.name, error)) from None
+            except (OSError, ValueError, RuntimeError) as error:
+                raise FmrError(f"--dask {self.address}: no Dask scheduler answers there ({reason(error)})") from None
         try:
             if self.client.dashboard_link:
                 self.say(f"dashboard: {self.client.dashboard_link}")
@@ -188,8 +192,11 @@ class DaskWorkers:
         """As ``Workers.run``. Raises FmrError where the scheduler is lost, or no worker is left that can be used."""
         from fmr_cli.workers.handing import Handing
 
-        with ThreadPoolExecutor(8, "fetch") as fetchers:
+        fetchers = ThreadPoolExecutor(8, "fetch")
+        try:
             yield from Handing(self, function, tasks, fetchers).answers()
+        finally:
+            fetchers.shutdown(wait=False, cancel_futures=True)  # one may be waiting for a worker that keeps silent
 
     def submit(self, function: Callable, argument: Any, to: set[str]) -> Any:
         """A future of function(argument) on one of these workers."""
@@ -211,13 +218,7 @@ class DaskWorkers:
         with suppress(Exception):
             if futures:
                 self.client.cancel(futures, force=True)
-            if self.fit:
-                self.client.run(let_go, workers=list(self.fit), wait=False)
-
-
-async def let_go() -> None:
-    """On the worker, at the end of a run; a coroutine since nobody waits for it."""
-    forget()
+            library().fire_and_forget([self.client.submit(forget, workers=[worker], pure=False) for worker in self.fit])
 
 
 def what_is_here() -> dict[str, str]:
@@ -240,21 +241,35 @@ def library() -> Any:
 def quiet(distributed: Any) -> None:
     """What Dask logs and warns about is said here in one line each, or does not matter."""
     for name in list(logging.Logger.manager.loggerDict):
-        if name.split(".")[0] in ("distributed", "tornado"):
+        if name.split(".")[0] in ("distributed", "tornado", "asyncio"):  # asyncio: of futures that were given up
             logging.getLogger(name).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", category=distributed.versions.VersionMismatchWarning)
 
 
-def unreachable(address: str, error: Exception) -> str:
-    """The line for a scheduler that could not be connected to."""
-    text = " ".join(str(error).split())
-    if "ssl" in text.lower() or "tls" in text.lower() or "Security" in text:
-        return (
-            f"--dask {address}: no TLS connection ({text[:120]}); name certificates in Dask's configuration, "
-            "distributed.comm.tls (see docs/cluster.md), and give the address as tls://"
+def check_address(address: str) -> None:
+    """Raises FmrError for what is no address, one where nobody listens, or TLS without certificates."""
+    from distributed import Security
+    from distributed.comm import get_address_host_port
+
+    scheme = address.split("://")[0]
+    try:
+        if scheme not in ("tcp", "tls"):
+            raise ValueError(f"{scheme}:// is not spoken here")
+        host, port = get_address_host_port(address)
+    except ValueError as error:
+        raise FmrError(f"--dask {address}: {reason(error)}; give an address such as tcp://host:8786") from None
+    if scheme == "tls" and not Security().get_connection_args("client").get("ssl_context"):
+        raise FmrError(
+            f"--dask {address}: no certificates for TLS; name them in Dask's configuration, under distributed.comm.tls: "
+            "ca-file, client.cert, client.key"
         )
-    if isinstance(error, ValueError | TypeError):
-        return f"--dask {address}: is no address of a scheduler ({text[:120]}), give one such as tcp://host:8786"
-    return (
-        f"--dask {address}: no scheduler answers within {CONNECT:.0f} s, check the address or start one: dask scheduler"
-    )
+    try:
+        socket.create_connection((host, port), CONNECT).close()
+    except OSError as error:
+        raise FmrError(
+            f"--dask {address}: nobody answers there ({reason(error)}); check the address, or start: dask scheduler"
+        ) from None
+
+
+def reason(error: BaseException) -> str:
+    return " ".join(str(getattr(error, "strerror", None) or error or type(error).__name__).split())[:200]

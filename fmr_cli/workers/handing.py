@@ -33,9 +33,18 @@ class Handed:
     task: Any
     since: float = 0.0
     copies: dict[str, tuple[Any, set[str]]] = field(default_factory=dict)
-    failures: int = 0
+    failures: int = 0  # that came back
+    suspect: bool = False  # its workers are gone, maybe for its sake: it is tried once more,
+    alone: bool = False  # while nothing else is
     answered: bool = False
     answer: Any = None
+
+    def take(self, answer: Any) -> None:
+        """The first answer counts."""
+        self.answered, self.answer = True, answer
+        for future, _ in self.copies.values():
+            future.release()
+        self.copies.clear()
 
 
 @dataclass
@@ -90,13 +99,25 @@ class Handing:
         for handed in self._unanswered():
             for key in [key for key, (_, allowed) in handed.copies.items() if not allowed & there]:
                 handed.copies.pop(key)[0].release()
-            if not handed.copies:
+                handed.suspect = True
+            if not handed.copies and not handed.suspect:
                 self._hand_out(handed, self.workers.responsive())
+        suspects = self._suspects()
+        if suspects and not any(handed.copies for handed in self.waiting):
+            if suspects[0].alone:
+                return suspects[0].take(
+                    LostError("several workers died over it, as for want of memory; give it fewer points")
+                )
+            suspects[0].alone = True
+            self._hand_out(suspects[0], {min(self.workers.responsive())})
+
+    def _suspects(self) -> list[Handed]:
+        return [handed for handed in self._unanswered() if handed.suspect]
 
     def _hand_out_more(self) -> None:
         count = self.workers.count
         room = min(AHEAD * count - len(self.waiting), PER_THREAD * count - len(self._unanswered()))
-        if self.more and room > 0:
+        if self.more and room > 0 and not self._suspects():
             new = [Handed(task) for task in islice(self.todo, room)]
             self.more = len(new) == room
             self.waiting += new
@@ -147,21 +168,15 @@ class Handing:
                 return
             if back.error is not None:
                 raise back.error
-            handed.answer = back.answer
             self.slowest = max(self.slowest, time.monotonic() - handed.since)
-        elif isinstance(back, KilledWorker):
-            handed.answer = LostError("several workers died over it, as for want of memory; give it fewer points")
-        elif isinstance(back, CancelledError | TimeoutError | OSError):
-            return  # the way there or back is broken, not the task
-        else:
+            handed.take(back.answer)
+        elif isinstance(back, KilledWorker):  # by this task or by one that the worker had as well
+            handed.suspect = True
+        elif not isinstance(back, CancelledError | TimeoutError | OSError):  # those: the way is broken, not the task
             handed.failures += 1
-            if handed.failures < COPIES:
-                return
-            raise FmrError(f"--dask {self.workers.name}: a task cannot be run there ({type(back).__name__}: {back})")
-        handed.answered = True
-        for future, _ in handed.copies.values():
-            future.release()
-        handed.copies.clear()
+            if handed.failures == COPIES:
+                what = f"{type(back).__name__}: {back}"
+                raise FmrError(f"--dask {self.workers.name}: a task cannot be run there ({what})")
 
 
 def call(work: tuple[Callable[[Any], Any], Any]) -> Came:

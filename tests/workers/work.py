@@ -48,3 +48,8 @@ def with_file(path: str) -> int:
     if not os.path.exists(path):
         raise UnfitError(f"{path} is not there")
     return os.getpid()
+
+
+def slow(number: int) -> int:
+    time.sleep(0.03)
+    return number
