@@ -61,7 +61,8 @@ class DaskWorkers:
         self.asked: dict[str, Any] = {}  # what each new worker has, once it answers
         self.refused: dict[str, str] = {}  # and why
         self.silent: set[str] = set()
-        self.looked = self.heard = self.had_workers = 0.0
+        self.looked = self.had_workers = 0.0
+        self.unheard: float | None = None  # since when the scheduler keeps silent
         self.client: Any = None
         self.cluster: Any = None
 
@@ -91,7 +92,7 @@ class DaskWorkers:
         try:
             if self.client.dashboard_link:
                 self.say(f"dashboard: {self.client.dashboard_link}")
-            self.heard = self.had_workers = time.monotonic()
+            self.had_workers = time.monotonic()
             while not self.fit:
                 self.look_at_workers()
                 time.sleep(0.02)
@@ -175,13 +176,14 @@ class DaskWorkers:
         try:
             answer = question()
         except (OSError, TimeoutError, CancelledError, RuntimeError, AttributeError):  # the last two: while it closes
-            if self.client.status == "closed" or time.monotonic() - self.heard > CONNECT:
+            self.unheard = self.unheard or time.monotonic()
+            if self.client.status == "closed" or time.monotonic() - self.unheard > CONNECT:
                 raise FmrError(
                     f"--dask {self.name}: lost the connection to the scheduler; what is written stays"
                 ) from None
             time.sleep(0.2)
             return None
-        self.heard = time.monotonic()
+        self.unheard = None
         return answer
 
     # The work.
