@@ -262,7 +262,7 @@ def check_address(address: str) -> None:
         raise FmrError(f"--dask {address}: {reason(error)}; give an address such as tcp://host:8786") from None
     if scheme == "tls" and not Security().get_connection_args("client").get("ssl_context"):
         raise FmrError(
-            f"--dask {address}: no certificates for TLS; name them in Dask's configuration, under distributed.comm.tls: "
+            f"--dask {address}: no certificates for TLS; name them in Dask's configuration, distributed.comm.tls: "
             "ca-file, client.cert, client.key"
         )
     try:
