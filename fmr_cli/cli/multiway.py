@@ -61,7 +61,8 @@ def multiway_command(
         from fmr_cli.io.outputs import check_outputs
         from fmr_cli.multiway import export
         from fmr_cli.multiway.known import Known, read_init_poses, read_links
-        from fmr_cli.multiway.pipeline import Progress, align_many
+        from fmr_cli.multiway.pipeline import align_many
+        from fmr_cli.multiway.survey import Progress
 
     check_outputs([(merged, WRITABLE)])
     known = Known(

@@ -7,7 +7,6 @@ taken at the common solution, weighted by its own noise, and only in the directi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +18,7 @@ from fmr_cli.geometry.observability import WEAK
 from fmr_cli.geometry.point_to_plane import point_to_plane
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.multiway.pose_graph import EXACT, Prior, adjoint
+from fmr_cli.multiway.workers import Workers
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 
 FINER = 2.0  # times the grid on which pairs are registered
@@ -93,7 +93,7 @@ def refine(
     pairs: list[tuple[int, int]],
     held: set[int],
     motion: Motion,
-    pool: Executor,
+    workers: Workers,
     priors: Iterable[Prior] = (),
 ) -> Refined:
     """The poses at which all pairs fit best at once. held: scans that don't move; priors: poses known beforehand."""
@@ -112,7 +112,7 @@ def refine(
             )
 
         both = [pair for i, j in pairs for pair in ((i, j), (j, i))]
-        systems = [s for s in pool.map(system, both) if s is not None]
+        systems = [s for s in workers.map(system, both) if s is not None]
         if not systems or not free:
             break
         floor = float(np.median([s.variance for s in systems])) / 9

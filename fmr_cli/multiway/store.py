@@ -5,7 +5,9 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from concurrent.futures import Future
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +34,10 @@ class Store:
         self.edges: dict[int, float] = {}
         self.kept: OrderedDict[int, Future[Prepared]] = OrderedDict()
         self.lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Goes to another process as what it was made from; there, all tasks of a run share one."""
+        return shared_store, (tuple(self.scans), self.seed, self.spill, tuple(self.edges.items()))
 
     def prepared(self, number: int) -> Prepared:
         """A scan made ready, on its shared grid where that is known. Raises FmrError where it cannot be."""
@@ -70,6 +76,13 @@ class Store:
             return None
         return self.spill / f"{self.scans[number].name}.npy"
 
+    def clear(self) -> None:
+        """Removes what was spilled."""
+        if self.spill and self.spill.is_dir():
+            for file in self.spill.iterdir():
+                file.unlink()
+            self.spill.rmdir()
+
     def let_go(self) -> None:
         """Lets go of the least recently used while more than CACHED_POINTS are kept."""
         with self.lock:
@@ -79,3 +92,11 @@ class Store:
                 if held > CACHED_POINTS:
                     held -= len(r.points)
                     del self.kept[number]
+
+
+@lru_cache(1)
+def shared_store(scans: tuple[Scan, ...], seed: int, spill: Path | None, edges: tuple[tuple[int, float], ...]) -> Store:
+    """The store that this process keeps for all tasks of one run."""
+    store = Store(list(scans), seed, spill)
+    store.edges = dict(edges)
+    return store
