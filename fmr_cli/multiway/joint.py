@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fmr_cli.geometry.motion import Motion, exp
-from fmr_cli.geometry.normals import neighbours, normals_and_variation
 from fmr_cli.geometry.observability import WEAK
 from fmr_cli.geometry.point_to_plane import point_to_plane
 from fmr_cli.geometry.sampling import sample
@@ -67,11 +66,10 @@ class System:
 def view(scan: Prepared, edge: float) -> View:
     """The scan on voxels of ``edge`` over FINER, or as fine as its spacing allows."""
     fine = min(max(edge / FINER, SPACINGS * scan.spacing), edge)
-    points = scan.surface(fine).points
-    tree = cKDTree(points)
-    normals = normals_and_variation(points, *neighbours(points, tree))[0]
+    surface = scan.surface(fine)
+    points = surface.points
     some = sample(np.arange(len(points)), POINTS, np.random.default_rng(scan.seed))
-    return View(fine, points, normals, tree, some, float(np.sqrt((points**2).sum(1).mean())))
+    return View(fine, points, surface.normals, surface.tree, some, float(np.sqrt((points**2).sum(1).mean())))
 
 
 def partners(
