@@ -18,7 +18,7 @@ from fmr_cli.io.files import reason
 from fmr_cli.registration import Options, Registration, align
 from fmr_cli.registration.export import aligned_cloud, merged_cloud, metrics
 from fmr_cli.registration.options import read_init
-from fmr_cli.workers.base import UnfitError, kept
+from fmr_cli.workers.base import check_there, kept
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,7 @@ class PairRunner:
 
     def do(self, block: Block) -> list[Done]:
         """The block's pairs. Raises ModelError, and UnfitError where this machine lacks a file that others have."""
-        for path in block.there:
-            if not path.exists():
-                raise UnfitError(f"{path} is not there; all workers need the files at the same path")
+        check_there(block.there)
         cache = kept("batch", lambda: CloudCache(self.cached_points))
         done = [self.one(pair, cache) for pair in block.pairs]
         cache.let_go(block.spent)

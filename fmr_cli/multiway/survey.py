@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -22,7 +23,7 @@ from fmr_cli.multiway.links import Journal, Link
 from fmr_cli.multiway.pose_graph import Prior
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.multiway.store import Store
-from fmr_cli.multiway.workers import Workers
+from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import Options
 from fmr_cli.registration.prepared import pair_edge
 from fmr_cli.registration.result import plain
@@ -60,11 +61,12 @@ class Survey:
         options: Options,
         known: Known,
         out: Path | None,
-        workers: Workers,
+        workers: Threads,
         progress: Callable[[Progress], None] | None,
     ) -> None:
         self.scans, self.options, self.known, self.out = scans, options, known, out
         self.workers, self.report = workers, progress or (lambda _: None)
+        self.name = uuid.uuid4().hex  # of this run, for what workers elsewhere keep
         self.seconds: dict[str, float] = {}
         self.messages: dict[int, str] = {}
         self.failed: set[int] = set()
@@ -119,8 +121,12 @@ class Survey:
         work: Callable[[Any], Any],
         items: Sequence[Any],
         arrived: Callable[[int, Any], None] = lambda number, result: None,
+        handed_out: bool = False,
     ) -> list[Any]:
-        """The results of ``work`` on all items, in their order, by all workers; progress is reported as they come."""
+        """The results of ``work`` on all items, in their order, by all workers; progress is reported as they come.
+
+        handed_out: by the cluster's workers.
+        """
         aligned = sum(link.status == "aligned" for link in self.links.values())
         done = 0
 
@@ -130,7 +136,7 @@ class Survey:
             arrived(number, result)
             self.report(Progress(stage, done, len(items), aligned, len(self.components)))
 
-        return self.workers.map(work, items, one)
+        return (self.workers.hand_out if handed_out else self.workers.map)(work, items, one)
 
     # A scan.
 

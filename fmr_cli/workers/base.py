@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from fmr_cli.errors import FmrError
@@ -45,12 +46,19 @@ class Workers(Protocol):
         ...
 
 
+def check_there(paths: Iterable[Path]) -> None:
+    """On a worker: raises UnfitError where it does not see a file that others see."""
+    for path in paths:
+        if not path.exists():
+            raise UnfitError(f"{path} is not there; all workers need the files at the same path")
+
+
 _kept: dict[str, Any] = {}
 _lock = threading.Lock()
 
 
 def kept(name: str, make: Callable[[], Any]) -> Any:
-    """What this worker's process keeps under a name until the run is over, made at the first call."""
+    """What this worker's process keeps under a name, made at the first call, until its workers are let go of."""
     with _lock:
         if name not in _kept:
             _kept[name] = make()

@@ -102,6 +102,8 @@ class DaskWorkers:
         return self
 
     def __exit__(self, *_: object) -> None:
+        with suppress(Exception):  # what they keep for these runs; nobody waits for those that keep silent
+            library().fire_and_forget([self.client.submit(forget, workers=[worker], pure=False) for worker in self.fit])
         if self.client is not self.address:
             with suppress(Exception):
                 self.client.close(timeout=5)
@@ -216,11 +218,10 @@ class DaskWorkers:
         return {key: worker for worker, keys in tasks.items() for key in keys}
 
     def give_up(self, futures: list[Any]) -> None:
-        """Cancels what is under way, and lets the workers go of what they kept for this run."""
+        """Cancels what is under way."""
         with suppress(Exception):
             if futures:
                 self.client.cancel(futures, force=True)
-            library().fire_and_forget([self.client.submit(forget, workers=[worker], pure=False) for worker in self.fit])
 
 
 def what_is_here() -> dict[str, str]:

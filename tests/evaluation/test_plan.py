@@ -21,7 +21,7 @@ def pairs(tmp_path) -> Path:
     """A CSV of three pairs, of which the second has no target."""
     a, b, truth = (SAMPLES / name for name in ("scan_a.ply", "scan_b.ply", "truth.txt"))
     path = tmp_path / "pairs.csv"
-    path.write_text(f"source,target,truth\n{a},{b},{truth}\n{a},{tmp_path}/no.ply,{truth}\n{a},{b},{truth}\n")
+    path.write_text(f"source,target,transform\n{a},{b},{truth}\n{a},{tmp_path}/no.ply,{truth}\n{a},{b},{truth}\n")
     return path
 
 
