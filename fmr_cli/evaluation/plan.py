@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import torch
+
 from fmr_cli.errors import FmrError
 from fmr_cli.evaluation import benchmark, experiments
 from fmr_cli.evaluation.benchmark import Outcome, failed, outcomes
@@ -16,6 +18,7 @@ from fmr_cli.evaluation.experiments import EXPERIMENTS, Clouds, Experiment, Row,
 from fmr_cli.evaluation.methods import Method, baselines, ours, product
 from fmr_cli.registration.models import Device, encoder, fast_encoder, pick_device
 from fmr_cli.registration.options import Options
+from fmr_cli.registration.pipeline import one_blas_thread
 from fmr_cli.workers import Workers
 from fmr_cli.workers.base import LostError, UnfitError, kept
 
@@ -66,7 +69,8 @@ class OnDataset:
     def outcomes(self, number: int) -> list[Outcome]:
         """Every method on the pair with that number."""
         data, methods, _ = on_worker(self.made)
-        return outcomes(data.pairs[number], data, methods)
+        with one_blas_thread():  # a product's last bits depend on how many threads share it
+            return outcomes(data.pairs[number], data, methods)
 
     def run(self, team: Workers) -> Generator[list[Outcome], None, None]:
         """A row a method for each pair, in the pairs' order. No pair ends the others."""
@@ -112,6 +116,8 @@ class OnScans:
         """Every method at one level: (experiment, number of the set, number of the level)."""
         name, place, level = task
         sets, methods, _ = on_worker(self.made)
+        if self.compared.threads == 1:
+            torch.set_num_threads(1)
         return experiments.at_level(
             EXPERIMENTS[name], level, sets[place], methods, self.pairs, self.points, self.compared.seed
         )

@@ -9,9 +9,11 @@ import csv
 import os
 import shutil
 import subprocess
+import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 distributed = pytest.importorskip("distributed")
@@ -23,6 +25,7 @@ import fmr_cli  # noqa: E402
 from fmr_cli import read_cloud, write_cloud  # noqa: E402
 from fmr_cli.batch import align_batch  # noqa: E402
 from fmr_cli.errors import FmrError  # noqa: E402
+from fmr_cli.multiway import align_many  # noqa: E402
 from fmr_cli.workers import DaskWorkers, cluster, handing  # noqa: E402
 from fmr_cli.workers.base import LostError  # noqa: E402
 
@@ -147,6 +150,40 @@ def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(share
     for file in files:
         if file.parent.name in ("transforms", "aligned"):
             assert (tmp_path / "dask" / file).read_bytes() == (tmp_path / "here" / file).read_bytes()
+
+
+def test_a_network_is_the_same(shared, tmp_path):
+    """Three scans, of which one is a moved copy of the first one's other points."""
+    a, b = (read_cloud(SAMPLES / f"scan_{name}.ply").select(slice(None, None, 6)) for name in "ab")
+    T = np.array([[0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1.0]])
+    c = read_cloud(SAMPLES / "scan_a.ply").select(slice(3, None, 6)).transformed(T)
+    for name, cloud in zip("abc", (a, b, c), strict=True):
+        write_cloud(tmp_path / f"{name}.ply", cloud)
+    scans = [tmp_path / f"{name}.ply" for name in "abc"]
+    with DaskWorkers(shared.address, say=lambda _: None) as workers:
+        have(workers, 2)
+        there = align_many(scans, workers=workers)
+    here = align_many(scans, workers=2)
+    assert len(here.links) == 3
+    assert np.array_equal([s.T_component_scan for s in here.scans], [s.T_component_scan for s in there.scans])
+    assert [vars(link)["confidence"] for link in here.links] == [vars(link)["confidence"] for link in there.links]
+
+
+def test_evaluate_is_the_same(shared):
+    """The command itself, by two workers and by none."""
+    found = []
+    for more in (["--dask", shared.address], []):
+        done = subprocess.run(
+            [sys.executable, "-m", "fmr_cli.cli", "evaluate", SAMPLES, "-o", shared.folder / f"e{len(more)}", "--no-align",
+             "--experiments", "noise", "--pairs", "2", "--points", "64", *more], capture_output=True, text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert ("dashboard: http" in done.stderr) == bool(more)
+        with (shared.folder / f"e{len(more)}" / "results.csv").open(newline="") as file:
+            found.append([{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)])
+    assert len(found[0]) == 10
+    assert found[0] == found[1]
 
 
 def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
