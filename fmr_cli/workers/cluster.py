@@ -105,8 +105,10 @@ class DaskWorkers:
         with suppress(Exception):  # what they keep for these runs; nobody waits for those that keep silent
             library().fire_and_forget([self.client.submit(forget, workers=[worker], pure=False) for worker in self.fit])
         if self.client is not self.address:
-            with suppress(Exception):
+            try:
                 self.client.close(timeout=5)
+            except Exception:  # the scheduler does not answer: nothing is to be tried again at the end of the process
+                self.client.status = "closed"
         if self.cluster is not None:
             self.cluster.close()
 

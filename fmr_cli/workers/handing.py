@@ -172,7 +172,9 @@ class Handing:
             handed.take(back.answer)
         elif isinstance(back, KilledWorker):  # by this task or by one that the worker had as well
             handed.suspect = True
-        elif not isinstance(back, CancelledError | TimeoutError | OSError):  # those: the way is broken, not the task
+        elif isinstance(back, CancelledError | TimeoutError | OSError):  # the way there or back is broken, not the task
+            handed.alone = False
+        else:
             handed.failures += 1
             if handed.failures == COPIES:
                 what = f"{type(back).__name__}: {back}"

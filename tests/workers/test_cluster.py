@@ -172,15 +172,16 @@ def test_a_network_is_the_same(shared, tmp_path):
 def test_evaluate_is_the_same(shared):
     """The command itself, by two workers and by none."""
     found = []
+    command = [sys.executable, "-m", "fmr_cli.cli", "evaluate", SAMPLES, "--no-align", "--experiments", "noise"]
     for more in (["--dask", shared.address], []):
+        out = shared.folder / f"evaluation{len(more)}"
         done = subprocess.run(
-            [sys.executable, "-m", "fmr_cli.cli", "evaluate", SAMPLES, "-o", shared.folder / f"e{len(more)}", "--no-align",
-             "--experiments", "noise", "--pairs", "2", "--points", "64", *more], capture_output=True, text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=120,
+            [*command, "-o", out, "--pairs", "2", "--points", "64", *more], capture_output=True, text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=240,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert ("dashboard: http" in done.stderr) == bool(more)
-        with (shared.folder / f"e{len(more)}" / "results.csv").open(newline="") as file:
+        with (out / "results.csv").open(newline="") as file:
             found.append([{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)])
     assert len(found[0]) == 10
     assert found[0] == found[1]
