@@ -9,17 +9,14 @@ import typer
 from rich.console import Console
 
 from fmr_cli.cli.console import progress, say, warn
-from fmr_cli.cli.options import Quiet
+from fmr_cli.cli.options import Dask, Quiet, chosen_workers
 from fmr_cli.errors import FmrError
 
 if TYPE_CHECKING:
-    from fmr_cli.evaluation.benchmark import Method as PairMethod
     from fmr_cli.evaluation.benchmark import Outcome
-    from fmr_cli.evaluation.datasets.pair import DataSet
-    from fmr_cli.evaluation.experiments import Clouds, Row
-    from fmr_cli.evaluation.methods import Method
-    from fmr_cli.feature_metric.encoder import Encoder
-    from fmr_cli.registration.models import Device
+    from fmr_cli.evaluation.experiments import Row
+    from fmr_cli.evaluation.plan import OnDataset, OnScans
+    from fmr_cli.workers import Workers
 
 FEATURES = "features"  # the maps of the paper's Figure 7: plots alone, no table
 EXPERIMENTS = "rotation,density,noise,overlap,scenes,features"
@@ -75,8 +72,9 @@ def evaluate_command(
     iterations: Annotated[int, typer.Option(help="Of the solver.", min=1)] = 10,
     plain: Annotated[bool, typer.Option("--plain/--no-plain", help="The paper's plain least squares as well.")] = True,
     workers: Annotated[
-        int, typer.Option(help="Pairs of a data set at a time; the seconds are honest with 1.", min=1)
+        int, typer.Option(help="Pairs, or levels, at a time; the seconds are honest with 1.", min=1)
     ] = 1,
+    dask: Dask = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same pairs.", min=0)] = 0,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where the encoder runs.")] = "auto",
     quiet: Quiet = False,
@@ -87,7 +85,9 @@ def evaluate_command(
     as quoted. On a folder of scans, the paper's experiments: errors by initial rotation, density, noise and overlap, of
     random pairs of centred clouds; lengths are in units of the cloud (its largest extent about 1).
     """
+    from fmr_cli.cores import usable_cores
     from fmr_cli.evaluation.datasets import recognised
+    from fmr_cli.evaluation.plan import Compared, OnDataset, OnScans, absolute
 
     if dataset and experiments:
         raise FmrError("--dataset and --experiments: give one of the two; the experiments draw pairs of their own")
@@ -97,45 +97,31 @@ def evaluate_command(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FmrError(f"{out}: cannot make this folder ({error.strerror}); give another --out") from None
-    if name:
-        run_dataset(name, scans, out, model or [], with_align, with_baselines, pairs, iterations, plain, workers, seed,
-                    quiet)  # fmt: skip
-    else:
-        run_experiments(chosen, scans, out, model or [], with_align, with_baselines, clouds, pairs or PAIRS, points,
-                        iterations, plain, seed, device)  # fmt: skip
+    threads = 1 if workers > 1 or dask else min(usable_cores(), 2)  # 2: as `fmr align`
+    compared = Compared(
+        absolute(model or []), with_align, with_baselines, plain, iterations, seed, threads, device
+    )  # fmt: skip
+    with chosen_workers(workers if workers > 1 or not dask else None, dask, quiet) as team:
+        if name:
+            run_dataset(OnDataset(name, absolute(scans), compared, pairs), team, out, quiet)
+        else:
+            run_experiments(
+                chosen, OnScans(absolute(scans), compared, clouds, pairs or PAIRS, points), team, out, quiet
+            )
     say(f"written to {out}", quiet=quiet)
 
 
-def run_dataset(
-    name: str, scans: list[Path], out: Path, models: list[Path], with_align: bool, with_baselines: bool,
-    pairs: int | None, iterations: int, plain: bool, workers: int, seed: int, quiet: bool,
-) -> None:  # fmt: skip
+def run_dataset(plan: OnDataset, team: int | Workers | None, out: Path, quiet: bool) -> None:
     """The methods on a data set: its table printed, results.csv, pairs.csv and a plot in ``out``."""
-    from fmr_cli.cores import usable_cores
-    from fmr_cli.evaluation.benchmark import methods, summarise
-    from fmr_cli.evaluation.datasets import read_dataset
+    from fmr_cli.evaluation.benchmark import summarise
     from fmr_cli.evaluation.quoted import quoted
-    from fmr_cli.registration.models import fast_encoder
-    from fmr_cli.registration.options import Options
     from fmr_cli.report.benchmark import plot, table, write_pairs, write_results
     from fmr_cli.report.evaluation import can_plot
+    from fmr_cli.workers.local import on_this_machine
 
-    threads = 1 if workers > 1 else min(usable_cores(), 2)  # 2: as `fmr align`
-    data = read_dataset(name, scans, seed).thinned(pairs)
-    warn(*data.notes, quiet=quiet)
-    compared: dict[str, PairMethod] = {}
-    for number, path in enumerate(models or [None]):
-        options = Options(model=path, seed=seed)
-        own, missing = methods(
-            data, options, fast_encoder(path), iterations, plain, with_baselines and not number, threads
-        )
-        warn(*missing, quiet=quiet)
-        compared |= (
-            own if path is None else {f"{key}, {path}" if "small_gicp" not in key else key: m for key, m in own.items()}
-        )
-    if not with_align:
-        compared = {key: method for key, method in compared.items() if not key.startswith("fmr align")}
-    rows = run_pairs(data, compared, workers, quiet)
+    data, _, missing = plan.made()
+    warn(*data.notes, *dict.fromkeys(missing), quiet=quiet)
+    rows = run_pairs(plan, on_this_machine(team, len(data.pairs)), quiet)
     measured, others = summarise(rows, data.by_scene), quoted(data.name)
     write_pairs(out / "pairs.csv", rows)
     write_results(out / "results.csv", data, measured, others)
@@ -149,14 +135,13 @@ def run_dataset(
              quiet=quiet)  # fmt: skip
 
 
-def run_pairs(data: DataSet, compared: dict[str, PairMethod], workers: int, quiet: bool) -> list[Outcome]:
+def run_pairs(plan: OnDataset, team: Workers, quiet: bool) -> list[Outcome]:
     """Every method on every pair; Ctrl-C ends it with the pairs that are done."""
-    from fmr_cli.evaluation.benchmark import run
-
+    data, methods, _ = plan.made()
     rows: list[Outcome] = []
     with progress(quiet) as bar:
         task = bar.add_task(data.name, total=len(data.pairs), said="")
-        done = run(data, compared, workers)
+        done = plan.run(team)
         try:
             for several in done:
                 rows += several
@@ -165,33 +150,34 @@ def run_pairs(data: DataSet, compared: dict[str, PairMethod], workers: int, quie
             done.close()
             if not rows:
                 raise
-            warn(f"stopped: the figures are of {len(rows) // len(compared)} pairs", quiet=quiet)
+            warn(f"stopped: the figures are of {len(rows) // len(methods)} pairs", quiet=quiet)
     return rows
 
 
-def run_experiments(
-    chosen: list[str], scans: list[Path], out: Path, models: list[Path], with_align: bool, with_baselines: bool,
-    clouds: int | None, pairs: int, points: int, iterations: int, plain: bool, seed: int, device: Device,
-) -> None:  # fmt: skip
-    """The paper's experiments on folders of scans."""
-    from fmr_cli.evaluation.experiments import read_clouds
-    from fmr_cli.registration.models import encoder, pick_device
-    from fmr_cli.report.evaluation import can_plot, write_csv
+def run_experiments(chosen: list[str], plan: OnScans, team: int | Workers | None, out: Path, quiet: bool) -> None:
+    """The paper's experiments on folders of scans: tables printed, results.csv and plots in ``out``."""
+    from fmr_cli.evaluation.experiments import EXPERIMENTS
+    from fmr_cli.report.evaluation import can_plot, plot, table, write_csv
+    from fmr_cli.workers.local import on_this_machine
 
-    encoders = {str(path): encoder(path, device) for path in models} or {"bundled": encoder(None, device)}
-    methods = chosen_methods(encoders, plain, with_align, with_baselines, iterations, device)
-    sets = [read_clouds(path, clouds, points, pick_device(device)) for path in scans]
-    warn(*(line for read in sets for line in read.skipped))
+    sets, _, missing = plan.made()
+    warn(*(line for read in sets for line in read.skipped), *missing, quiet=quiet)
     plots = can_plot()
     if not plots:
-        warn("no plots, matplotlib is not installed; pip install 'fmr-cli[eval]'")
+        warn("no plots, matplotlib is not installed; pip install 'fmr-cli[eval]'", quiet=quiet)
     rows: list[Row] = []
     for name in chosen:
-        if name != FEATURES:
-            rows += run_experiment(name, sets, methods, pairs, points, seed, out if plots else None)
-            write_csv(out / "results.csv", rows)
-        elif plots:
-            plot_features(encoders, sets[0], points, seed, out)
+        if name == FEATURES:
+            if plots:
+                plot_features(plan, out)
+            continue
+        experiment = EXPERIMENTS[name]
+        found = [row for level in plan.run(experiment, on_this_machine(team, 2)) for row in level]
+        Console(highlight=False).print(table(experiment, found))
+        if plots and len(experiment.levels) > 1:
+            plot(out / f"{name}.png", experiment, found)
+        rows += found
+        write_csv(out / "results.csv", rows)
 
 
 def chosen_experiments(text: str) -> list[str]:
@@ -205,43 +191,13 @@ def chosen_experiments(text: str) -> list[str]:
     return names
 
 
-def chosen_methods(
-    encoders: dict[str, Encoder], plain: bool, with_align: bool, with_baselines: bool, iterations: int, device: Device
-) -> dict[str, Method]:
-    """What is compared, by the name in the tables; says which baselines are not installed."""
-    from fmr_cli.evaluation.methods import baselines, ours, product
-
-    methods: dict[str, Method] = {"fmr align": product()} if with_align else {}
-    for name, weights in encoders.items():
-        methods[name] = ours(weights, iterations, True)
-        if plain:
-            methods[f"{name}, plain"] = ours(weights, iterations, False)
-    if with_baselines:
-        others, missing = baselines(device, iterations)
-        methods |= others
-        warn(*missing)
-    return methods
-
-
-def run_experiment(
-    name: str, sets: list[Clouds], methods: dict[str, Method], pairs: int, points: int, seed: int, plots: Path | None
-) -> list[Row]:
-    """One experiment on all sets: its table printed, its plot in the folder ``plots``, its rows given back."""
-    from fmr_cli.evaluation.experiments import EXPERIMENTS, run
-    from fmr_cli.report.evaluation import plot, table
-
-    experiment = EXPERIMENTS[name]
-    rows = [row for clouds in sets for row in run(experiment, clouds, methods, pairs, points, seed)]
-    Console(highlight=False).print(table(experiment, rows))
-    if plots and len(experiment.levels) > 1:
-        plot(plots / f"{name}.png", experiment, rows)
-    return rows
-
-
-def plot_features(encoders: dict[str, Encoder], clouds: Clouds, points: int, seed: int, out: Path) -> None:
-    """The feature maps of every encoder, a PNG each."""
+def plot_features(plan: OnScans, out: Path) -> None:
+    """The feature maps of every encoder on the first cloud, a PNG each."""
     from fmr_cli.evaluation.experiments import feature_maps
+    from fmr_cli.registration.models import encoder
     from fmr_cli.report.evaluation import plot_maps
 
-    for label, weights in encoders.items():
-        plot_maps(out / f"features_{Path(label).stem}.png", feature_maps(weights, clouds, points, seed))
+    sets, what = plan.made()[0], plan.compared
+    for path in what.models or [None]:
+        maps = feature_maps(encoder(path, what.device), sets[0], plan.points, what.seed)
+        plot_maps(out / f"features_{path.stem if path else 'bundled'}.png", maps)

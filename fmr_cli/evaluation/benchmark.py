@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,17 +129,6 @@ def alone(solver: NumpySolver, iterations: int, robust: bool, seed: int, points:
 
 def posed(baseline: Baseline) -> Method:
     return lambda source, target: Estimate(baseline(source, target))
-
-
-def run(dataset: DataSet, methods: Mapping[str, Method], workers: int = 1) -> Generator[list[Outcome], None, None]:
-    """A row a method for each pair, in the pairs' order; so many pairs at a time. No pair ends the others."""
-    with ThreadPoolExecutor(workers) as pool:
-        ahead = [pool.submit(outcomes, pair, dataset, methods) for pair in dataset.pairs]
-        try:
-            for future in ahead:
-                yield future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def outcomes(pair: Pair, dataset: DataSet, methods: Mapping[str, Method]) -> list[Outcome]:
