@@ -8,6 +8,7 @@ block ``text`` right after one that runs is its output. Comments before a block,
 
     <!-- in tests: --scans 20 -> --scans 4 -->    what the tests run in its place, to be quick
     <!-- exit: 3 -->                              it ends with this code (uncertain)
+    <!-- not run: needs a cluster -->             it is only shown
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 BLOCK = re.compile(
-    r"(?P<said>(?:<!-- (?:in tests|exit): .*? -->\n)*)```(?P<kind>bash|python)\n(?P<code>.*?)```\n"
+    r"(?P<said>(?:<!-- (?:in tests|exit|not run): .*? -->\n)*)```(?P<kind>bash|python)\n(?P<code>.*?)```\n"
     r"(?:\n```text\n(?P<output>.*?)```\n)?",
     re.DOTALL,
 )
@@ -45,6 +46,8 @@ class Example:
 def examples(text: str) -> list[Example]:
     found = []
     for block in BLOCK.finditer(text):
+        if "<!-- not run: " in block["said"]:
+            continue
         quick = block["code"]
         for old, new in re.findall(r"<!-- in tests: (.*?) -> (.*?) -->", block["said"]):
             if old not in quick:
@@ -86,6 +89,8 @@ def update(page: Path) -> None:
     text, printed = page.read_text("utf-8"), iter(run_page(page, quick=False))
 
     def filled(block: re.Match[str]) -> str:
+        if "<!-- not run: " in block["said"]:
+            return block[0]
         output = next(printed)
         if block["output"] is None:
             return block[0]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import Field, fields
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fmr_cli.cli.options import takes_registration_options
-from fmr_cli.registration.options import Options, choices, flag
+from fmr_cli.registration.options import Options
 
 
 def test_the_defaults_are_the_librarys():
