@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from fmr_cli.cli.console import UNCERTAIN, busy, points_bar, quick_imports, say, show_log, warn
-from fmr_cli.cli.options import BinColumns, Verbose, columns, takes_registration_options
+from fmr_cli.cli.options import BinColumns, Report, Verbose, columns, takes_registration_options
 from fmr_cli.registration.options import Options
 
 
@@ -24,6 +24,7 @@ def align_command(
     aligned: Annotated[Path | None, typer.Option(help="The moved source, with each point's residual.")] = None,
     merged: Annotated[Path | None, typer.Option(help="Both clouds, with a source_id: 0 source, 1 target.")] = None,
     metrics: Annotated[Path | None, typer.Option(help="Everything said about the result, as .json.")] = None,
+    report: Report = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the metrics to stdout, not the matrix.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
     bin_columns: BinColumns = None,
@@ -36,7 +37,12 @@ def align_command(
     show_log(verbose)
     outputs.check_outputs([
         (out, (".txt", ".npy", ".json")), (aligned, io.WRITABLE), (merged, io.WRITABLE), (metrics, (".json",)),
+        (report, (".html", ".htm")),
     ])  # fmt: skip
+    if report:
+        from fmr_cli.report.page import check_report
+
+        check_report(report)
     with busy(f"registering {source.name} onto {target.name}", quiet):
         from fmr_cli.registration.prepared import AT_MOST
 
@@ -61,6 +67,11 @@ def align_command(
         outputs.write_json(metrics, said)
     if out:
         io.write_transform(out, T)
+    if report:
+        with busy("writing the report", quiet):
+            from fmr_cli.report.pair_page import write_pair
+
+            write_pair(report, moving, fixed, found, [path for path in (out, aligned, merged, metrics) if path])
     if as_json:
         typer.echo(json.dumps(said, indent=2))
     elif not out:

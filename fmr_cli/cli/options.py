@@ -7,6 +7,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import Field, fields
 from inspect import Parameter
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -19,6 +20,7 @@ Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, help="Say what was decided and why; -vv says more.")
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Where an error comes from, as a traceback.")]
+Report = Annotated[Path | None, typer.Option(help="A page that shows the result, one .html that needs no network.")]
 BinColumns = Annotated[
     str | None,
     typer.Option(help="What the float32 of a .bin are, such as x,y,z,intensity,ring; told by the values if not given."),
