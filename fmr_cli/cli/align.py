@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from fmr_cli.cli.console import UNCERTAIN, busy, points_bar, quick_imports, say, show_log, warn
-from fmr_cli.cli.options import BinColumns, Report, Verbose, columns, takes_registration_options
+from fmr_cli.cli.options import BinColumns, Report, Verbose, check_report, columns, takes_registration_options
 from fmr_cli.registration.options import Options
 
 
@@ -39,10 +39,7 @@ def align_command(
         (out, (".txt", ".npy", ".json")), (aligned, io.WRITABLE), (merged, io.WRITABLE), (metrics, (".json",)),
         (report, (".html", ".htm")),
     ])  # fmt: skip
-    if report:
-        from fmr_cli.report.page import check_report
-
-        check_report(report)
+    check_report(report)
     with busy(f"registering {source.name} onto {target.name}", quiet):
         from fmr_cli.registration.prepared import AT_MOST
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from fmr_cli.cli.console import UNCERTAIN, progress, quick_imports, say, show_log
-from fmr_cli.cli.options import Quiet, Verbose, takes_registration_options
+from fmr_cli.cli.console import UNCERTAIN, busy, progress, quick_imports, say, show_log
+from fmr_cli.cli.options import Quiet, Report, Verbose, check_report, takes_registration_options
 from fmr_cli.registration.options import Options
 
 
@@ -26,6 +26,7 @@ def batch_command(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Pairs at a time; one a core if not given.", show_default=False)
     ] = None,
+    report: Report = None,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
@@ -33,6 +34,7 @@ def batch_command(
     from collections import Counter
 
     show_log(verbose)
+    check_report(report)
     with quick_imports():
         from fmr_cli.batch import align_batch
 
@@ -47,6 +49,11 @@ def batch_command(
         rows = align_batch(
             manifest, out, options, aligned=aligned, merged=merged, resume=resume, workers=workers, on_row=on_row
         )
+    if report:
+        with busy("writing the report", quiet):
+            from fmr_cli.report.batch_page import write_batch
+
+            write_batch(report, manifest.parent, out, rows)
     count = Counter(row["status"] for row in rows)
     said = ", ".join(f"{count[status]} {status}" for status in ("aligned", "uncertain", "failed"))
     say(f"{said}: {out / 'results.csv'}", quiet=quiet)

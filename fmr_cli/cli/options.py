@@ -27,6 +27,14 @@ BinColumns = Annotated[
 ]
 
 
+def check_report(path: Path | None) -> None:
+    """Before a long computation: --report can be written. Raises FmrError."""
+    if path is not None:
+        from fmr_cli.report.page import check_page
+
+        check_page(path)
+
+
 def columns(given: str | None) -> tuple[str, ...] | None:
     """--bin-columns as names. Raises FmrError where x, y and z are not among them, or a name is there twice."""
     if given is None:

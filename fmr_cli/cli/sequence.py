@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fmr_cli.cli.console import UNCERTAIN, progress, say, show_log
-from fmr_cli.cli.options import Quiet, Verbose
+from fmr_cli.cli.console import UNCERTAIN, busy, progress, say, show_log
+from fmr_cli.cli.options import Quiet, Report, Verbose, check_report
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,6 +49,7 @@ def sequence_command(
     start: Annotated[int, typer.Option(help="The first scan, counted from 0.", min=0)] = 0,
     stop: Annotated[int | None, typer.Option(help="The scan before which to stop; none if not given.", min=0)] = None,
     step: Annotated[int, typer.Option(help="Take every so many-th scan.", min=1)] = 1,
+    report: Report = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a stopped run has left off.")] = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
@@ -59,6 +60,7 @@ def sequence_command(
     from fmr_cli.sequence import SequenceOptions, align_sequence, find_scans
 
     show_log(verbose)
+    check_report(report)
     outputs.check_outputs([(out, (out.suffix.lower(),)), (residuals, (".csv",)), (merged, io.WRITABLE)])
     found = find_scans(scans, start, stop, step, [path for path in (out, residuals, merged) if path])
     say(*found.notes, quiet=quiet)
@@ -70,6 +72,11 @@ def sequence_command(
     with progress(quiet) as bar:
         on_row = follow(bar, quiet)
         result = align_sequence(found, out, options, residuals=residuals, merged=merged, resume=resume, on_row=on_row)
+    if report:
+        with busy("writing the report", quiet):
+            from fmr_cli.report.sequence_page import write_sequence
+
+            write_sequence(report, result, found, options)
     say(*result.summary(), quiet=quiet)
     if true is not None:
         compare(result.poses, true, out, quiet)

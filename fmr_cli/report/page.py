@@ -26,10 +26,8 @@ STATUS = {  # of a pair, a link, a scan, a frame: a class for the colour, and a 
 }  # fmt: skip
 
 
-def check_report(path: Path | None) -> None:
+def check_page(path: Path) -> None:
     """Before a long computation: the file can be written and what makes it is installed. Raises FmrError."""
-    if path is None:
-        return
     check_outputs([(path, (".html", ".htm"))])
     missing = [package for module, package in NEEDED.items() if importlib.util.find_spec(module) is None]
     if missing:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -73,8 +74,29 @@ def picture(clouds: list[tuple[np.ndarray, tuple[int, int, int]]], plane: Plane,
     image = np.zeros((side, side, 4), np.uint8)
     image[..., :3] = total / np.maximum(weight, 1)[..., None]
     image[..., 3] = np.where(weight > 0, 255, 0)
+    return data_uri(Image.fromarray(image).quantize(16))
+
+
+def ground(xy: np.ndarray, box: np.ndarray, side: int = 900) -> str:
+    """Points (N, 2) within ``box`` (2, 2), low and high, as a grey picture of their density on a clear ground."""
+    from PIL import Image
+
+    size = box[1] - box[0]
+    width, height = np.maximum((size / size.max() * side).astype(int), 1)
+    column, row = ((xy - box[0]) / size * [width, height]).astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    count = np.zeros((height, width))
+    np.add.at(count, (height - 1 - row[inside], column[inside]), 1)
+    most = np.quantile(count[count > 0], 0.98) if inside.any() else 1.0
+    image = np.full((height, width, 4), 128, np.uint8)
+    image[..., 3] = np.where(count > 0, 60 + 160 * np.minimum(count / most, 1), 0)
+    return data_uri(Image.fromarray(image).quantize(12))
+
+
+def data_uri(image: Any) -> str:
+    """A Pillow image as a PNG within the page."""
     buffer = io.BytesIO()
-    Image.fromarray(image).quantize(16).save(buffer, "PNG", optimize=True)
+    image.save(buffer, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 

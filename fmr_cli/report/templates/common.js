@@ -14,6 +14,8 @@ const shares = (text) => new Uint16Array(buffer(text));
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
 const said = (value, digits = 3) => (value === null || !isFinite(value) ? "–" : String(Number(value.toPrecision(digits))));
 
+const literal = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;"); // plotly reads tags in its texts
+
 // --- Plots: each is a function that gives {data, layout}; drawn anew when the theme changes.
 const plots = new Map();
 function baseLayout() {
@@ -22,6 +24,7 @@ function baseLayout() {
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", margin: { l: 60, r: 20, t: 20, b: 50 },
     font: { color: colour("text"), family: "system-ui, sans-serif", size: 13 }, showlegend: false,
     xaxis: { ...axis }, yaxis: { ...axis }, uirevision: "keep",
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("soft"), activecolor: colour("text") },
   };
 }
 function axes(layout, x, y) {
@@ -29,7 +32,7 @@ function axes(layout, x, y) {
   Object.assign(layout.yaxis, y);
   return layout;
 }
-const config = { displaylogo: false, responsive: true, plotlyServerURL: "", modeBarButtonsToRemove: ["sendDataToCloud", "lasso2d", "select2d"] };
+const config = { displaylogo: false, displayModeBar: "hover", responsive: true, plotlyServerURL: "", modeBarButtonsToRemove: ["sendDataToCloud", "lasso2d", "select2d"] };
 function plot(id, make) {
   if (!byId(id)) return;
   plots.set(id, make);
@@ -70,10 +73,10 @@ function sceneLayout() {
   const layout = baseLayout();
   layout.margin = { l: 0, r: 0, t: 0, b: 0 };
   layout.scene = { aspectmode: "data", xaxis: { ...axis, title: { text: "x" } }, yaxis: { ...axis, title: { text: "y" } }, zaxis: { ...axis, title: { text: "z" } },
-    camera: { eye: { x: 1, y: -1, z: 0.8 } }, uirevision: "keep", dragmode: "orbit" };
+    camera: { eye: { x: 1.2, y: -1.2, z: 0.95 } }, uirevision: "keep", dragmode: "orbit" };
   return layout;
 }
-const looks = { top: [0, -1e-3, 1.6], front: [0, -1.6, 0], side: [1.6, 0, 0], slant: [1, -1, 0.8] };
+const looks = { top: [0, -1e-3, 1.6], front: [0, -1.6, 0], side: [1.6, 0, 0], slant: [1.2, -1.2, 0.95] };
 function turned([x, y, z], how) {
   if (looks[how]) return looks[how];
   let r = Math.hypot(x, y, z), yaw = Math.atan2(y, x), tilt = Math.asin(z / r);

@@ -15,16 +15,22 @@ function shownClouds() {
     { name: "source", points: placed[n], values, colour: colour("source"), ends: { name, low: 0, high: page.limit, open: true } },
   ];
 }
-function sceneExtras() { // the directions that are not determined
+function sceneExtras() { // the directions that are not determined: an arrow each way to shift, a dashed axis to turn about
   const length = page.size / 4, tint = colour("bad");
-  return page.arrows.flatMap(({ kind, vector, words }) => {
-    const tip = vector.map((v) => v * length), way = (k) => [-tip[k], tip[k]];
-    const line = { type: "scatter3d", mode: "lines+text", x: way(0), y: way(1), z: way(2), line: { color: tint, width: 8, dash: kind === "shift" ? "solid" : "dash" },
-      text: ["", "not determined: " + words], textfont: { color: tint, size: 14 }, hoverinfo: "text", name: words };
-    const heads = { type: "cone", x: [-tip[0], tip[0]], y: [-tip[1], tip[1]], z: [-tip[2], tip[2]], u: [-vector[0], vector[0]], v: [-vector[1], vector[1]],
-      w: [-vector[2], vector[2]], sizemode: "absolute", sizeref: length / 5, anchor: "tail", showscale: false, colorscale: [[0, tint], [1, tint]], hoverinfo: "skip" };
-    return kind === "shift" ? [line, heads] : [line];
+  return page.arrows.map(({ kind, vector, words }) => {
+    const tip = vector.map((v) => v * length), side = across(vector).map((v) => (v * length) / 12);
+    const head = (sign) => [[1, -1], [1, 1]].map(([, s]) => tip.map((t, k) => sign * t * 0.85 + s * side[k]));
+    const ends = [tip.map((t) => -t), tip];
+    const way = kind === "shift" ? [head(-1)[0], ends[0], head(-1)[1], ends[0], ends[1], head(1)[0], ends[1], head(1)[1]] : ends;
+    const text = way.map(() => "");
+    text[kind === "shift" ? way.length - 1 : 0] = "not determined: " + words;
+    return { type: "scatter3d", mode: "lines+text", x: way.map((p) => p[0]), y: way.map((p) => p[1]), z: way.map((p) => p[2]), text, name: words, hoverinfo: "name",
+      line: { color: tint, width: 7, dash: kind === "shift" ? "solid" : "dash" }, textfont: { color: tint, size: 14 }, textposition: "top center" };
   });
+}
+function across([x, y, z]) { // a unit vector at right angles
+  const other = Math.abs(z) < 0.9 ? [-y, x, 0] : [0, -z, y], n = Math.hypot(...other);
+  return other.map((v) => v / n);
 }
 const BINS = 60;
 function histogramPlot() {
