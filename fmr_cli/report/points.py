@@ -23,15 +23,20 @@ def shown(points: np.ndarray, count: int = SHOWN, seed: int = 0) -> np.ndarray:
     return rng.permutation(sample(points, count, rng))
 
 
+def raw(values: np.ndarray) -> str:
+    """An array's bytes in base64."""
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
+
+
 def packed(values: np.ndarray) -> str:
     """Numbers as little-endian float32 in base64."""
-    return base64.b64encode(np.ascontiguousarray(values, "<f4").tobytes()).decode("ascii")
+    return raw(values.astype("<f4"))
 
 
 def packed_shares(values: np.ndarray, limit: float) -> str:
     """Numbers from 0 to ``limit`` as 16 bits in base64; what is beyond it as the largest."""
     shares = np.clip(np.nan_to_num(values / max(limit, 1e-300), nan=1.0), 0, 1)
-    return base64.b64encode(np.round(shares * 65535).astype("<u2").tobytes()).decode("ascii")
+    return raw(np.round(shares * 65535).astype("<u2"))
 
 
 @dataclass(frozen=True)

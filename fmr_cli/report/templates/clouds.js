@@ -17,6 +17,7 @@ function column(points, axis, keep = null) {
   return out;
 }
 function marker(cloud, size, keep = null, bar = false) {
+  if (cloud.own) return { size, color: keep ? keep.map((i) => cloud.own[i]) : cloud.own, line: { width: 0 } };
   if (!cloud.values) return { size, color: cloud.colour, opacity: 1, line: { width: 0 } };
   const values = keep ? keep.map((i) => cloud.values[i]) : Array.from(cloud.values);
   const ends = cloud.ends; // the values that 0 and 65535 stand for, and their name
@@ -28,7 +29,8 @@ function scenePlot() {
   const size = Number(byId("size").value), clouds = shownClouds();
   const withBar = clouds.findIndex((c) => c.values);
   const data = clouds.map((cloud, n) => ({ type: "scatter3d", mode: "markers", name: cloud.name, hoverinfo: "name", x: column(cloud.points, 0), y: column(cloud.points, 1),
-    z: column(cloud.points, 2), marker: marker(cloud, size, null, n === withBar) }));
+    z: column(cloud.points, 2),
+    marker: marker(cloud, size, null, n === withBar) }));
   return { data: [...data, ...(window.sceneExtras ? sceneExtras() : [])], layout: sceneLayout() };
 }
 function bounds(axis) { // of the middle 99.8 %: a stray point would take the slider's length
@@ -64,8 +66,13 @@ function sectionPlot() {
   layout.uirevision = `cut along ${cut.axis}`;
   return { data, layout };
 }
-function startClouds() {
-  byId("section-axis").value = shortestAxis();
+function startClouds(section = null) { // section: {axis, at, thick} to begin with
+  byId("section-axis").value = section ? section.axis : shortestAxis();
+  if (section) {
+    const [low, high] = bounds(section.axis);
+    byId("section-at").value = 1000 * (section.at - low) / (high - low || 1);
+    byId("section-thick").value = 50 * (Math.log10(section.thick * 20 / page.size) + 1.5);
+  }
   ["section-axis", "section-at", "section-thick"].forEach((id) => byId(id).addEventListener("input", () => soon("section")));
   byId("size").addEventListener("input", () => soon("scene", "section"));
   plot("section", sectionPlot);
