@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from fmr_cli.cli.console import say, warn
+from fmr_cli.cli.options import Report, check_report
 from fmr_cli.errors import FmrError
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ def evaluate_command(
     plain: Annotated[bool, typer.Option("--plain/--no-plain", help="The paper's plain least squares as well.")] = True,
     seed: Annotated[int, typer.Option(help="The same seed gives the same pairs.", min=0)] = 0,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where the encoder runs.")] = "auto",
+    report: Report = None,
 ) -> None:
     """The paper's experiments on SCANS: errors by initial rotation, density, noise, overlap, as tables, CSV and plots.
 
@@ -51,8 +53,10 @@ def evaluate_command(
     """
     from fmr_cli.evaluation.experiments import read_clouds
     from fmr_cli.registration.models import encoder, pick_device
-    from fmr_cli.report.evaluation import can_plot, write_csv
+    from fmr_cli.report.evaluation import write_csv
+    from fmr_cli.report.plots import can_plot
 
+    check_report(report)
     chosen = chosen_experiments(experiments)
     encoders = {str(path): encoder(path, device) for path in model or []} or {"bundled": encoder(None, device)}
     methods = chosen_methods(encoders, plain, with_baselines, iterations, device)
@@ -72,6 +76,11 @@ def evaluate_command(
             write_csv(out / "results.csv", rows)
         elif plots:
             plot_features(encoders, sets[0], points, seed, out)
+    if report:
+        from fmr_cli.report.evaluation_page import write_evaluation
+
+        options = {"scans": ", ".join(map(str, scans)), "methods": ", ".join(methods), "pairs": pairs}
+        write_evaluation(report, rows, options | {"points": points, "iterations": iterations, "seed": seed})
     say(f"written to {out}")
 
 

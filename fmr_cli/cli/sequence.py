@@ -112,8 +112,9 @@ def compare(poses: np.ndarray, true: np.ndarray, out: Path, quiet: bool) -> None
     """Errors against the truth, and a plot, beside ``out``."""
     from fmr_cli.evaluation import trajectory
     from fmr_cli.io import outputs
+    from fmr_cli.report.trajectory import plot_paths
 
     errors = trajectory.evaluate(poses, true)
     outputs.write_json(out.with_suffix(".evaluation.json"), errors)
-    trajectory.plot(out.with_suffix(".png"), poses, true)
+    plot_paths(out.with_suffix(".png"), poses, true)
     say(*trajectory.summary(errors), quiet=quiet)

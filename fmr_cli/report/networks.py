@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ class Node:
         return transform_points(self.T_common_scan, self.points)
 
 
-@lru_cache(maxsize=None)
+@cache
 def some_points(path: Path) -> np.ndarray:
     """Some points (N, 3) of a file in random order; none where it cannot be read: a picture is then missing."""
     try:

@@ -78,5 +78,3 @@ def number(value: Any, digits: int = 4) -> str:
     if isinstance(value, int):
         return f"{value:,}".replace(",", "\u202f")
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
-
-

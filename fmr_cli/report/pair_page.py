@@ -168,5 +168,3 @@ def file_row(role: str, cloud: PointCloud) -> dict[str, Any]:
         "format": cloud.format or "", "layout": cloud.layout or "", "crs": (cloud.crs or "")[:80],
         "extent": " × ".join(f"{x:.4g}" for x in np.ptp(cloud.points, axis=0)),
     }  # fmt: skip
-
-

@@ -18,7 +18,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.io import read_cloud, read_transform
-from fmr_cli.io.stream import COLORS
+from fmr_cli.io.stream import COLORS, CloudStream, collect
 from fmr_cli.report.networks import number_of
 from fmr_cli.report.page import write_page
 from fmr_cli.report.points import SOURCE, TARGET, packed, packed_shares, raw
@@ -253,8 +253,7 @@ class Window:
 
     def run(self) -> None:
         """The window until it is closed. Keys: 1 to 5 colours; X, Y, Z a section, again none; [ and ] move it."""
-        if not has_screen():
-            raise FmrError("no screen here (DISPLAY is not set); --screenshot FILE.png or --html FILE works without one")
+        check_screen()
         window = self.o3d.visualization.VisualizerWithKeyCallback()
         self.open(window, visible=True)
 
@@ -292,8 +291,18 @@ class Window:
             self.cut()
 
 
-def has_screen() -> bool:
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+def check_screen() -> None:
+    """Raises FmrError where a window would have no screen."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise FmrError(
+            "no screen here (DISPLAY is not set); fmr view --screenshot FILE.png or --html FILE works without one"
+        )
+
+
+def view_pair(source: CloudStream, target: CloudStream, T_target_source: np.ndarray) -> None:
+    """The window with a registered pair, until it is closed."""
+    clouds = [collect(source.transformed(T_target_source), IN_WINDOW // 4), collect(target, IN_WINDOW // 4)]
+    Window(with_residuals(clouds), "file", 2.0, None).run()
 
 
 def quiet_natives(o3d: Any) -> Any:
@@ -334,5 +343,3 @@ def write_view(path: Path, clouds: list[PointCloud], by: Coloring, size: float, 
         + (f" and {len(drawn) - 4} more" if len(drawn) > 4 else ""), offers=offers, by=by if by in offers else "file",
         size=size, middle=middle.tolist(), files=[(c.name, c.count, len(f)) for c, f in zip(clouds, few, strict=True)],
     )  # fmt: skip
-
-

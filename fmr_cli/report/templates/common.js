@@ -32,7 +32,7 @@ function axes(layout, x, y) {
   Object.assign(layout.yaxis, y);
   return layout;
 }
-const config = { displaylogo: false, displayModeBar: "hover", responsive: true, plotlyServerURL: "", modeBarButtonsToRemove: ["sendDataToCloud", "lasso2d", "select2d"] };
+const config = { displaylogo: false, displayModeBar: "hover", responsive: true, plotlyServerURL: "", showSendToCloud: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
 function plot(id, make) {
   if (!byId(id)) return;
   plots.set(id, make);
