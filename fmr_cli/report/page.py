@@ -65,14 +65,15 @@ def own(name: str) -> str:
 def plotly_js() -> str:
     """The library as the plotly package brings it, read without importing that package."""
     spec = importlib.util.find_spec("plotly")
-    assert spec and spec.submodule_search_locations
+    assert spec is not None
+    assert spec.submodule_search_locations
     return (Path(spec.submodule_search_locations[0]) / "package_data" / "plotly.min.js").read_text("utf-8")
 
 
 def number(value: Any, digits: int = 4) -> str:
     """A number for a table; what is not there or not finite as a dash."""
     if value is None or value == "" or (isinstance(value, float) and not math.isfinite(value)):
-        return "–"
+        return "\u2013"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
