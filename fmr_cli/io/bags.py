@@ -1,7 +1,7 @@
-"""Bags of ROS 1 and ROS 2 (also MCAP and SQLite files alone) by rosbags: each PointCloud2 is a scan, in its sensor's frame.
+"""Bags of ROS 1 and ROS 2 (also MCAP and SQLite files alone) by rosbags: each PointCloud2 is a scan in its own frame.
 
-FILE#3 is the third scan of the only topic of clouds, FILE#:ouster:points:3 that of /ouster/points: a topic's slashes are
-written as colons, since a part of a path may have none.
+FILE#3 is the third scan of the only topic of clouds, FILE#:ouster:points:3 that of /ouster/points: a topic's slashes
+are written as colons, since a part of a path may have none.
 """
 
 from __future__ import annotations
