@@ -54,7 +54,7 @@ def align_command(
             from fmr_cli.registration import align, export
             from fmr_cli.registration.mirror import HINT as MIRRORED
             from fmr_cli.registration.pipeline import mirror_fits
-        found = align(moving, fixed, options)
+        found = align(moving, fixed, options, check=bool(metrics or as_json or verbose))
         if found.status != "aligned" and not options.allow_mirror:
             fits = mirror_fits(moving, fixed, options)
             found.warnings += [] if fits is None else [MIRRORED.format(fits)]

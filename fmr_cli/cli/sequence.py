@@ -37,6 +37,13 @@ def sequence_command(
     voxel_size: Annotated[
         float | None, typer.Option(help="The working voxel edge; from the data if not given.", min=0.0)
     ] = None,
+    init_poses: Annotated[
+        Path | None,
+        typer.Option(help="Poses known beforehand, by odometry or GNSS: CSV of scan,pose[,sigma_rot_deg,sigma_shift]."),
+    ] = None,
+    known_map: Annotated[
+        Path | None, typer.Option("--map", help="A known map: poses are those in it, the first scan is found in it.")
+    ] = None,
     loop_closure: Annotated[
         bool, typer.Option("--loop-closure", help="Close loops in --out; the path before goes to NAME.odometry.*.")
     ] = False,
@@ -56,6 +63,7 @@ def sequence_command(
     """Register every scan of a sequence into the frame of the first."""
     from fmr_cli import io
     from fmr_cli.io import outputs
+    from fmr_cli.multiway.known import read_init_poses
     from fmr_cli.sequence import SequenceOptions, align_sequence, find_scans
 
     show_log(verbose)
@@ -67,9 +75,12 @@ def sequence_command(
         format=form, camera_frame=camera_frame, voxel_size=voxel_size or None, merged_voxel=merged_voxel or None,
         loop_closure=loop_closure, deskew=deskew,
     )  # fmt: skip
+    told = read_init_poses(init_poses) if init_poses else None
     with progress(quiet) as bar:
-        on_row = follow(bar, quiet)
-        result = align_sequence(found, out, options, residuals=residuals, merged=merged, resume=resume, on_row=on_row)
+        result = align_sequence(
+            found, out, options, init_poses=told, known_map=known_map, residuals=residuals, merged=merged,
+            resume=resume, on_row=follow(bar, quiet),
+        )  # fmt: skip
     say(*result.summary(), quiet=quiet)
     if true is not None:
         compare(result.poses, true, out, quiet)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from fmr_cli.batch.manifest import numbered, safe
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.io.files import check_readable
-from fmr_cli.io.folders import find_scans
+from fmr_cli.io.folders import find_scans, natural
 
 LISTS = (".lst", ".list")  # and a .txt whose first line names a file
 
@@ -99,9 +98,3 @@ def names(sources: Sequence[Path | PointCloud]) -> list[str]:
         unique.append(next(free for free in numbered(name) if free.casefold() not in taken))
         taken.add(unique[-1].casefold())
     return unique
-
-
-def natural(name: str) -> list[tuple[int, int, str]]:
-    """A key that puts scan2 before scan10."""
-    return [(0, int(part), "") if part.isdecimal() and part.isascii() else (1, 0, part.casefold())
-            for part in re.split(r"([0-9]+)", name) if part]  # fmt: skip
