@@ -26,7 +26,7 @@ from fmr_cli.geometry.motion import Motion
 from fmr_cli.io.files import check_writable, reason
 from fmr_cli.multiway import adjustment, consistency, looks, pose_graph, visibility
 from fmr_cli.multiway.consistency import Component
-from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of
+from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of, poses_in_file
 from fmr_cli.multiway.links import Hypothesis, Journal, Link, best_of, key_of, register
 from fmr_cli.multiway.network import Network
 from fmr_cli.multiway.pose_graph import Prior
@@ -134,7 +134,9 @@ class Survey:
         self.journal = Journal(None if out is None else out / "journal.jsonl", self.settings())
         self.fixed_numbers = [number_of(name, scans, "--fixed") for name in dict.fromkeys(known.fixed)]
         self.anchor = None if known.anchor is None else number_of(known.anchor, scans, "--anchor")
-        self.poses = {number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()}
+        self.poses = poses_in_file([scan.path for scan in scans]) | {
+            number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()
+        }
         self.never, self.asked, self.given = set(), [], []  # type: ignore[var-annotated]
         for link in known.links:
             ends = tuple(number_of(name, scans, "--links") for name in (link.source, link.target))
