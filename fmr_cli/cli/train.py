@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fmr_cli.cli.console import err, progress, say, warn
-from fmr_cli.cli.options import Report, check_report
+from fmr_cli.cli.options import Report, Topic, check_report
 from fmr_cli.errors import FmrError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def train_command(
     scans: Annotated[
-        list[Path] | None, typer.Argument(help="Scans, meshes, or folders of them.", show_default=False)
+        list[Path] | None, typer.Argument(help="Scans, meshes, bags, or folders of scans.", show_default=False)
     ] = None,
     unsupervised: Annotated[bool, typer.Option("--unsupervised", help="The Chamfer loss alone; no label.")] = False,
     semi_supervised: Annotated[
@@ -49,6 +49,7 @@ def train_command(
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same weights (CPU).", min=0)] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to train.")] = "auto",
     report: Report = None,
+    topic: Topic = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
 ) -> None:
     """Learn an encoder from SCANS, starting from the bundled one; see what it gained.
@@ -57,9 +58,12 @@ def train_command(
     The folder of the run gets model.safetensors (the best epoch's weights, for `fmr align --model`), README.md (what
     they were made from, held-out figures), recipe.toml, metrics.csv and state.safetensors (for --resume).
     """
+    from fmr_cli.io.parts import with_topic
     from fmr_cli.training.run import prepare, settings
 
     check_report(report)
+    scans = [with_topic(path, topic) for path in scans or []] or None
+
     if resume and (unsupervised or semi_supervised or recipe or start or learning_rate is not None or seed is not None):
         raise FmrError("--resume goes on with the settings saved in --out; leave the other settings away")
     chosen = settings(

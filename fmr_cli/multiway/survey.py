@@ -18,7 +18,7 @@ from fmr_cli.geometry.frames import Frame, enter_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.multiway import consistency, looks, visibility
 from fmr_cli.multiway.consistency import Component, Join
-from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of
+from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of, poses_in_file
 from fmr_cli.multiway.links import Journal, Link
 from fmr_cli.multiway.pose_graph import Prior
 from fmr_cli.multiway.scans import Scan
@@ -83,7 +83,9 @@ class Survey:
         self.journal = Journal(None if out is None else out / "journal.jsonl", self.settings())
         self.fixed_numbers = [number_of(name, scans, "--fixed") for name in dict.fromkeys(known.fixed)]
         self.anchor = None if known.anchor is None else number_of(known.anchor, scans, "--anchor")
-        self.poses = {number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()}
+        self.poses = poses_in_file([scan.path for scan in scans]) | {
+            number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()
+        }
         self.never: set[Ends] = set()
         self.asked: list[tuple[int, int, np.ndarray | None]] = []  # "try" and "known" links: source, target, pose
         self.given: list[tuple[int, int, np.ndarray]] = []
