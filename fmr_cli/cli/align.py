@@ -46,7 +46,7 @@ def align_command(
         )
         with quick_imports():  # after reading: a bad file is said at once
             from fmr_cli.registration import align, export
-        found = align(moving, fixed, options)
+        found = align(moving, fixed, options, check=bool(metrics or as_json or verbose))
     T, said, warnings = found.T_target_source, export.metrics(moving, fixed, found), [*found.warnings]
     files = [io.open_cloud(path, bin_columns=named) for path in (source, target)]
     if aligned:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from fmr_cli.cloud import PointCloud
+from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, refinement
 from fmr_cli.registration.confidence import LIKELY, Judge
@@ -33,6 +33,7 @@ SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no mo
 FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
 FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000))  # the looks after it, while none is sure
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
+CHECKS = 5  # iterations of the IC solver from the pose found, where asked for
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
 log = logging.getLogger(__name__)
@@ -44,12 +45,17 @@ def prepare(cloud: PointCloud, seed: int = 0) -> Prepared:
 
 
 def align(
-    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options(), threads: int = 2
+    source: PointCloud | Prepared,
+    target: PointCloud | Prepared,
+    options: Options = Options(),
+    threads: int = 2,
+    check: bool = False,
 ) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
     threads: 2 for what concerns one cloud alone to be done for both side by side, 1 where pairs run side by side
-    already. The answer is the same bit for bit, whatever their number and the machine's. Raises RegistrationError
+    already. The answer is the same bit for bit, whatever their number and the machine's. check: also let the paper's IC
+    solver go on from the pose found, see ``Registration.feature_check``. Raises RegistrationError
     where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
     contradict each other.
     """
@@ -71,6 +77,9 @@ def align(
                 best = replace(best, T_target_source=refinement.exact(judge.pair, T))
         with time.stage("verdict"):
             found = describe(judge.pair, best, judge.candidates[1:], source, factor, options)
+        if check:
+            with time.stage("check"):
+                found.feature_check = feature_check(judge.pair, best.T_target_source)
     found.warnings += [*source.notes, *target.notes]
     if found.status != "aligned" and not options.scale and (hint := unit_hint(source.points, target.points)):
         found.warnings.append(hint)
@@ -161,6 +170,18 @@ def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
     if judge.pair.allowed(T):
         judge.consider(T, hypothesis.start, hypothesis.errors)
         log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
+
+
+def feature_check(pair: Pair, T_target_source: np.ndarray) -> dict[str, Any]:
+    """Whether the paper's metric agrees with a pose: what a few iterations of its solver from there do."""
+    there = hypotheses.from_solver(pair, T_target_source, "check", CHECKS)[0]
+    centre = pair.s.points.mean(0)[None]
+    shift = transform_points(there.T_target_source, centre) - transform_points(T_target_source, centre)
+    return {
+        "errors": there.errors,
+        "angle": angle_degrees(np.linalg.inv(T_target_source) @ there.T_target_source),
+        "shift": float(np.linalg.norm(shift)),
+    }
 
 
 def may_overlap_fully(pair: Pair) -> bool:
