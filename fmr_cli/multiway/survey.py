@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -74,6 +74,7 @@ class Survey:
         self.edges: dict[int, float] = {}
         self.described: dict[tuple[int, float], looks.Description] = {}
         self.views: dict[int, visibility.Viewed] = {}
+        self.through: dict[tuple[int, int, bytes], tuple[int, int]] = {}  # what has been compared already
         self.looks: dict[Ends, looks.Look] = {}
         self.links: dict[Ends, Link] = {}
         self.tried: set[tuple[int, int, str]] = set()
@@ -183,9 +184,15 @@ class Survey:
             return 0.0
         return looks.overlap(a, b, T_target_source)
 
-    def seen_through(self, source: int, target: int, T_target_source: np.ndarray) -> float:
-        """The share of one scan that the other one sees through at a pose."""
-        return visibility.contradiction(self.viewed(source), self.viewed(target), T_target_source)
+    def seen_through(self, pairs: Iterable[tuple[int, int, np.ndarray]]) -> float:
+        """The share of the points of pairs (source, target, pose) that the other scan sees through, all together."""
+        counts = []
+        for source, target, T in pairs:
+            key = (source, target, T.tobytes())
+            if key not in self.through:
+                self.through[key] = visibility.contradiction(self.viewed(source), self.viewed(target), T)
+            counts.append(self.through[key])
+        return sum(x for x, _ in counts) / max(sum(said for _, said in counts), 1)
 
     def motion(self, source: int, target: int, unit: float = 1.0) -> Motion:
         """What may move between two centred frames, lengths in ``unit``."""
