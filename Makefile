@@ -33,7 +33,7 @@ docs: .venv/installed-for-docs
 
 # Every extra: no test is skipped for want of a package.
 .venv/installed-for-tests: .venv/installed
-	$(INSTALL) '.[eval,e57,baselines,dask,docs,dev]'
+	$(INSTALL) '.[eval,report,e57,ros,crs,baselines,dask,docs,dev]'
 	touch $@
 
 .venv/installed-for-docs: .venv/installed

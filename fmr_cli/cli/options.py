@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import Field, fields
 from functools import partial
 from inspect import Parameter
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -25,6 +26,8 @@ Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, help="Say what was decided and why; -vv says more.")
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Where an error comes from, as a traceback.")]
+PICTURES = (".png", ".pdf", ".svg")
+Report = Annotated[Path | None, typer.Option(help="A page that shows the result, one .html that needs no network.")]
 BinColumns = Annotated[
     str | None,
     typer.Option(help="What a .bin holds, such as x,y,z,intensity,ring:u2 (float32 without a type)."),
@@ -61,6 +64,30 @@ def chosen_workers(workers: int | None, dask: str | None, quiet: bool) -> Iterat
 
     with DaskWorkers(dask, workers, partial(say, quiet=quiet)) as team:
         yield team
+
+
+def check_report(path: Path | None) -> None:
+    """Before a long computation: --report can be written. Raises FmrError."""
+    if path is not None:
+        from fmr_cli.report.page import check_page
+
+        check_page(path)
+
+
+def check_picture(path: Path | None) -> None:
+    """Before a long computation: --picture can be made. Raises FmrError."""
+    if path is not None:
+        from fmr_cli.report import plots
+
+        plots.check_picture(path)
+
+
+def check_screen(wanted: bool) -> None:
+    """Before a long computation: --view has a screen. Raises FmrError."""
+    if wanted:
+        from fmr_cli.report import view
+
+        view.check_screen()
 
 
 def columns(given: str | None) -> tuple[str, ...] | None:

@@ -14,7 +14,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
-from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name
+from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name, topic_of
 from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
 from fmr_cli.vectors import unturned
@@ -167,28 +167,39 @@ def scans_of(path: str | Path, topic: str | None = None) -> list[ScanPart]:
     """
     path = Path(path)
     module, _, file, part = find_module(path, SUFFIXES)
-    if module.__name__.rsplit(".", 1)[1] not in PARTED or part is not None:
+    topic = topic or topic_of(part)
+    if module.__name__.rsplit(".", 1)[1] not in PARTED or (part is not None and topic is None):
         return [ScanPart("", np.eye(4), 0)]
-    if not is_bag_folder(file):
-        check_readable(file)
+    check_scan(path)
     with naming(file):
         return module.scans(file, topic) if topic is not None else module.scans(file)
 
 
 def scan_paths(path: str | Path, topic: str | None = None) -> list[Path]:
     """What to read each scan of a file by: FILE#1, FILE#2, ... of a file that holds several, else the file itself."""
-    path = Path(path)
     parts = scans_of(path, topic)
     if len(parts) == 1 and not parts[0].name:
-        return [path]
-    return [path.with_name(f"{path.name}#{part_name(number, topic)}") for number in range(1, len(parts) + 1)]
+        return [Path(path)]
+    _, _, file, part = find_module(Path(path), SUFFIXES)
+    topic = topic or topic_of(part)
+    return [file.with_name(f"{file.name}#{part_name(number, topic)}") for number in range(1, len(parts) + 1)]
 
 
 def holds_scans(path: str | Path) -> bool:
-    """Whether a path is of a kind that may hold several scans: a bag, an E57, a PTX."""
-    path = Path(path)
-    known = FORMATS.get(path.suffix.lower())
-    return is_bag_folder(path) or (path.is_file() and known is not None and known[0] in PARTED)
+    """Whether a path is a file of a kind that may hold several scans, and none of them: a bag, an E57, a PTX."""
+    try:
+        module, _, file, part = find_module(Path(path), SUFFIXES)
+    except CloudFileError:
+        return False
+    whole = part is None or topic_of(part) is not None
+    return whole and file.exists() and module.__name__.rsplit(".", 1)[1] in PARTED
+
+
+def check_scan(path: str | Path) -> None:
+    """Raises CloudFileError where the file of a scan, FILE or FILE#part, is not there or of no kind that is read."""
+    _, _, file, _ = find_module(Path(path), SUFFIXES)
+    if not is_bag_folder(file):
+        check_readable(file)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
@@ -248,7 +259,7 @@ def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str,
     part = None
     if "#" in path.name and suffixes is SUFFIXES and not path.exists():
         name, part = path.name.rsplit("#", 1)
-        path = path.with_name(name)
+        path = path.with_name(name) if name else path
     if suffixes is SUFFIXES and is_bag_folder(path):
         return importlib.import_module("fmr_cli.io.bags"), "bag", path, part
     packed = path.suffix.lower() == ".gz"

@@ -1,7 +1,7 @@
-"""Bags of ROS 1 and ROS 2 (also MCAP and SQLite files alone) by rosbags: each PointCloud2 is a scan, in its sensor's frame.
+"""Bags of ROS 1 and ROS 2 (also MCAP and SQLite files alone) by rosbags: each PointCloud2 is a scan in its own frame.
 
-FILE#3 is the third scan of the only topic of clouds, FILE#:ouster:points:3 that of /ouster/points: a topic's slashes are
-written as colons, since a part of a path may have none.
+FILE#3 is the third scan of the only topic of clouds, FILE#:ouster:points:3 that of /ouster/points: a topic's slashes
+are written as colons, since a part of a path may have none.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import to_cloud, unique
 from fmr_cli.io.files import reason
-from fmr_cli.io.parts import ScanPart, choose
+from fmr_cli.io.parts import ScanPart, choose, topic_of
 from fmr_cli.io.pcd import unpack_colors
 from fmr_cli.io.stream import Wanted
 
@@ -53,7 +53,7 @@ class Bag:
 
     def choose(self, wanted: str | None) -> str:
         """The topic that is meant: the one given, or the only one that has clouds. Raises CloudFileError."""
-        topics = sorted({c.topic for c in self.reader.connections if c.msgtype in CLOUDS + LIVOX})
+        topics = sorted({c.topic for c in self.reader.connections if c.msgtype in CLOUDS + LIVOX and c.msgcount})
         if wanted is not None:
             if wanted not in topics:
                 raise CloudFileError(f"has no clouds on the topic {wanted!r}; there are {', '.join(topics) or 'none'}")
@@ -100,7 +100,9 @@ def scans(path: Path, topic: str | None = None) -> list[ScanPart]:
 def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
     """All clouds after each other, or the one that is wanted. Of several, ``scan`` numbers them from 1."""
     topic, part = wanted.topic, wanted.part
-    if part is not None and ":" in part:
+    if (whole := topic_of(part)) is not None:
+        topic, part = whole, None
+    elif part is not None and part.startswith(":"):
         name, part = part.rsplit(":", 1)
         topic = name.replace(":", "/")
     bag = opened(path, topic)

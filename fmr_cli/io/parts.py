@@ -50,3 +50,21 @@ def is_bag_folder(path: Path) -> bool:
 def part_name(number: int, topic: str | None) -> str:
     """What stands behind # for a scan, numbers from 1; a topic's slashes are written as colons."""
     return str(number) if topic is None else f"{topic.replace('/', ':')}:{number}"
+
+
+def topic_of(part: str | None) -> str | None:
+    """The topic that is meant by a part such as :ouster:points, all its scans; None where it is one scan, or none."""
+    if part is None or not part.startswith(":") or part.rsplit(":", 1)[1].isdecimal():
+        return None
+    return part.replace(":", "/")
+
+
+def with_topic(path: Path, topic: str | None) -> Path:
+    """FILE#:topic where a topic is given."""
+    return path if topic is None else path.with_name(f"{path.name}#{topic.replace('/', ':')}")
+
+
+def label_of(path: Path) -> str:
+    """What to call a scan: the file's stem, and its part behind that, house_2 of house.e57#2."""
+    name, _, part = path.name.partition("#")
+    return path.stem if path.exists() or not part else f"{Path(name).stem}_{part.strip(':').replace(':', '_')}"

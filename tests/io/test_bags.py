@@ -12,7 +12,10 @@ pytest.importorskip("rosbags")
 from bag_files import HESAI, LIVOX, OUSTER, VELODYNE, records, write_bag
 
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io import read_cloud, scan_paths, scans_of, write_cloud
+from fmr_cli.io import folders, read_cloud, scan_paths, scans_of, write_cloud
+from fmr_cli.io.parts import with_topic
+from fmr_cli.multiway.scans import list_scans
+from fmr_cli.sequence import find_scans
 from fmr_cli.sequence.deskew import scan_times
 
 KINDS = ("a.bag", "a.mcap", "a")
@@ -77,6 +80,21 @@ def test_what_is_wrong_with_a_bag_is_one_line(tmp_path: Path) -> None:
     empty = write_bag(tmp_path / "b.mcap", {})
     with pytest.raises(CloudFileError, match="has no topic of PointCloud2"):
         read_cloud(empty)
+
+
+def test_a_bag_is_a_sequence_and_material_for_training(tmp_path: Path) -> None:
+    given = scans(4)
+    bag = write_bag(tmp_path / "drive.mcap", {"/a": [records(OUSTER, p) for p in given], "/b": []})
+    for path in (bag, with_topic(bag, "/a")):
+        found = find_scans(path, step=2)
+        assert [found.name(k) for k in range(2)] == (
+            ["drive.mcap#1", "drive.mcap#3"] if path == bag else ["drive.mcap#:a:1", "drive.mcap#:a:3"]
+        )
+        np.testing.assert_allclose(found.times - found.times[0], [0, 0.2], atol=1e-6)
+        assert np.array_equal(found.read(1, attributes=False).points, given[2])
+        assert len(folders.find_scans([path])) == 4
+    names = [scan.name for scan in list_scans([bag])]
+    assert names == ["drive_1", "drive_2", "drive_3", "drive_4"]
 
 
 def test_livox_own_messages(tmp_path: Path) -> None:
