@@ -16,6 +16,7 @@ from fmr_cli.evaluation.benchmark import Outcome, Summary
 from fmr_cli.evaluation.datasets.pair import DataSet
 from fmr_cli.evaluation.quoted import Quoted
 from fmr_cli.io.files import atomic_write
+from fmr_cli.report import plots
 
 COLUMNS = (
     "dataset", "method", "measured", "pairs", "recall", "recall_of_pairs", "rre_deg", "rte", "precision_of_aligned",
@@ -78,19 +79,18 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]
 
 def plot(path: Path, dataset: DataSet, outcomes: Sequence[Outcome]) -> None:
     """The share of the pairs whose error is below a bound, over that bound: rotation and shift, a line a method."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((10, 4), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, name, label in zip(axes, ("rre", "rte"), ("rotation error, deg", "shift, scans' unit"), strict=True):
-        for method in dict.fromkeys(row.method for row in outcomes):
-            error = np.sort([getattr(row, name) for row in outcomes if row.method == method])
-            axis.step(np.maximum(error, 1e-9), np.arange(1, len(error) + 1) / len(error), where="post", label=method)
-        finite = [e for row in outcomes if np.isfinite(e := getattr(row, name)) and e > 0]
-        axis.set(xscale="log", xlabel=label, ylim=(-0.02, 1.02))
-        if finite:
-            axis.set_xlim(max(np.quantile(finite, 0.02) / 2, 1e-6), max(finite) * 1.1)
-    axes[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
-    axes[0].legend(fontsize="small")
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    panels = (("rre", "rotation error, deg"), ("rte", "shift, scans' unit"))
+    methods = list(dict.fromkeys(row.method for row in outcomes))
+    with plots.figure(path, plots.PAGE, 2.8) as figure:
+        axes = figure.subplots(1, len(panels), sharey=True)
+        for axis, (name, label) in zip(axes, panels, strict=True):
+            known = [e for row in outcomes if 0 < (e := getattr(row, name)) < np.inf] or [1.0]
+            low, high = max(float(np.quantile(known, 0.02)) / 2, 1e-6), 1.1 * max(known)
+            axis.set(xscale="log", xlabel=label, xlim=(low, high), ylim=(-0.03, 1.03))
+            for number, method in enumerate(methods):
+                error = np.sort([getattr(row, name) for row in outcomes if row.method == method])
+                style = plots.look(number) | {"marker": "", "label": method}
+                share = np.arange(len(error) + 1) / len(error)
+                axis.step(np.clip([low, *error], low, 10 * high), share, where="post", **style)
+        axes[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
+        axes[1].legend(fontsize="small", frameon=False)
