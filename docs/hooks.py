@@ -22,6 +22,7 @@ MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fills in what is made from the code: ``<!-- commands -->``, ``<!-- experiment: noise -->``, ..."""
+    markdown = markdown.replace("```text\n```\n", "")  # an output that has not been filled in
     markdown = markdown.replace("<!-- commands -->", commands())
     markdown = re.sub(r"<!-- experiment: (.*?) -->", lambda found: experiment(found[1]), markdown)
     markdown = markdown.replace("<!-- calibration -->", calibration())
