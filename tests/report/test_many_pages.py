@@ -92,24 +92,15 @@ def batch_rows(room, out: Path) -> list[dict[str, str]]:
     _, _, truth = room
     (out / "transforms").mkdir(parents=True)
     rows = []
-    for n, (a, b, status, confidence) in enumerate(
-        [(1, 0, "aligned", 0.99), (2, 1, "aligned", 0.9), (3, 2, "uncertain", 0.3)]
-    ):
+    pairs = [(1, 0, "aligned", "0.99"), (2, 1, "aligned", "0.9"), (3, 2, "uncertain", "0.3")]
+    for n, (a, b, status, confidence) in enumerate(pairs):
         write_transform(out / "transforms" / f"{n}.txt", np.linalg.inv(truth[b]) @ truth[a])
-        rows.append({"source": f"scan{a}.ply", "target": f"scan{b}.ply", "status": status, "confidence": str(confidence),
+        rows.append({"source": f"scan{a}.ply", "target": f"scan{b}.ply", "status": status, "confidence": confidence,
                      "overlap": "0.5", "inlier_rmse": "0.01", "seconds": "1.5", "transform": f"transforms/{n}.txt",
                      "message": "only 9% of the smaller scan lies on the other one" if n == 2 else ""})  # fmt: skip
     empty = {"confidence": "", "overlap": "", "inlier_rmse": "", "transform": "", "seconds": "0.1"}
-    return [
-        *rows,
-        {
-            "source": f"{EVIL}.ply",
-            "target": "scan0.ply",
-            "status": "failed",
-            "message": f"{EVIL}: no such file",
-            **empty,
-        },
-    ]
+    bad = {"source": f"{EVIL}.ply", "target": "scan0.ply", "status": "failed", "message": f"{EVIL}: no such file"}
+    return [*rows, bad | empty]
 
 
 @pytest.fixture
@@ -225,8 +216,9 @@ def test_a_training_run(tmp_path, monkeypatch):
     )
     (tmp_path / "recipe.toml").write_text("# <b>\n")
     trainer = SimpleNamespace(
-        folder=SimpleNamespace(path=tmp_path), progress=SimpleNamespace(best=1, step=100, seconds=9.0, epoch=2, scores={}),
-        quality=lambda epoch: (0.5 if epoch == 0 else 0.75,), task=SimpleNamespace(measure="success", measured="x", described=["y"]),
+        folder=SimpleNamespace(path=tmp_path), quality=lambda epoch: (0.5 if epoch == 0 else 0.75,),
+        progress=SimpleNamespace(best=1, step=100, seconds=9.0, epoch=2, scores={}),
+        task=SimpleNamespace(measure="success", measured="x", described=["y"]),
     )  # fmt: skip
     monkeypatch.setattr(training_page, "score_table", lambda _: [("noise", "0.5", "0.75")])
     monkeypatch.setattr(training_page, "verdict", lambda *_: "better")

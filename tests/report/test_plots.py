@@ -24,7 +24,7 @@ def test_names_stand_apart_and_where_they_belong(wanted):
     found = plots.spread(np.array(wanted), 5.0)
     assert (np.diff(found) >= 5 - 1e-9).all()
     if len(wanted) and (np.diff(wanted) >= 5).all():
-        np.testing.assert_allclose(found, wanted)
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
     if wanted:
         assert found.mean() == pytest.approx(np.mean(wanted), abs=1e-6)  # as near to them as together possible
 

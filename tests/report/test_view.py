@@ -18,8 +18,8 @@ BOX = np.random.default_rng(0).random((500, 3)) * [4, 3, 2]
 @pytest.fixture
 def files(tmp_path):
     """Two files, the second 10 units off along x."""
-    write_cloud(tmp_path / "a.ply", PointCloud(BOX, {"red": np.full(500, 255, np.uint8), "green": np.zeros(500, np.uint8),
-                                                     "blue": np.zeros(500, np.uint8)}))  # fmt: skip
+    dark = np.zeros(500, np.uint8)
+    write_cloud(tmp_path / "a.ply", PointCloud(BOX, {"red": dark + np.uint8(255), "green": dark, "blue": dark}))
     write_cloud(tmp_path / "b.ply", PointCloud(BOX + np.array([10.0, 0, 0]), {"intensity": np.arange(500.0)}))
     return [tmp_path / "a.ply", tmp_path / "b.ply"]
 
@@ -59,13 +59,13 @@ def test_what_is_no_network(files, tmp_path, text):
 
 
 def test_the_pair_of_a_batch(files, tmp_path):
-    with pytest.raises(FmrError, match="holds neither network.json"):
+    with pytest.raises(FmrError, match=r"holds neither network\.json"):
         view.load(files, None, tmp_path, 10_000)
     write_transform(tmp_path / "T.txt", shift(10))
     (tmp_path / "results.csv").write_text("source,target,status,transform\na.ply,b.ply,aligned,T.txt\n")
     clouds, _ = view.load(files, None, tmp_path, 10_000)
     np.testing.assert_allclose(clouds[0].points, clouds[1].points, atol=1e-6)
-    with pytest.raises(FmrError, match="no transform of b.ply onto a.ply"):
+    with pytest.raises(FmrError, match=r"no transform of b\.ply onto a\.ply"):
         view.load(files[::-1], None, tmp_path, 10_000)
     with pytest.raises(FmrError, match="one pair is shown"):
         view.load(files[:1], None, tmp_path, 10_000)
