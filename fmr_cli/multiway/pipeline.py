@@ -33,6 +33,7 @@ from fmr_cli.multiway.pose_graph import Prior
 from fmr_cli.multiway.scans import Scan, list_scans
 from fmr_cli.multiway.store import Store
 from fmr_cli.registration import Options
+from fmr_cli.registration.models import local_encoder
 from fmr_cli.registration.result import plain
 
 FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
@@ -117,6 +118,7 @@ class Survey:
     ) -> None:
         self.scans, self.options, self.known, self.out = scans, options, known, out
         self.workers, self.report = workers, progress or (lambda _: None)
+        self.local = local_encoder(options.model)
         self.seconds: dict[str, float] = {}
         self.messages: dict[int, str] = {}  # what is wrong or odd about a scan
         self.failed: set[int] = set()
@@ -264,7 +266,7 @@ class Survey:
 
     def description(self, number: int, edge: float) -> looks.Description:
         if (number, edge) not in self.described:
-            self.described[number, edge] = looks.describe(self.store.prepared(number), edge)
+            self.described[number, edge] = looks.describe(self.store.prepared(number), edge, self.local)
         return self.described[number, edge]
 
     def moments(self) -> dict[int, np.ndarray]:

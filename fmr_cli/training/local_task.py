@@ -39,23 +39,13 @@ class LocalNet(nn.Module):
 
 
 def read_local_start(name: str) -> dict[str, Tensor] | None:
-    """The weights to start from: "scratch" is None, "base" the bundled ones, else a file. Raises ModelError."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    from fmr_cli.registration.models import bundled_local_path
+    """The weights to start from: "scratch" is None, "base" the bundled ones, else a file's. Raises ModelError."""
+    from fmr_cli.registration.models import model
 
     if name == "scratch":
         return None
-    try:
-        if name == "base":
-            with bundled_local_path() as path:
-                return load_file(path)
-        return load_file(name)
-    except FileNotFoundError:
-        raise ModelError(f"{name}: no such model file; give a .safetensors file written by `fmr train`") from None
-    except (SafetensorError, OSError) as error:
-        raise ModelError(f"{name}: not a safetensors file ({error}); give one written by `fmr train`") from None
+    found = model(None if name == "base" else name)
+    return {name: torch.from_numpy(array) for name, array in (found.weights.local or model().weights.local).items()}
 
 
 def info_nce(a: Tensor, b: Tensor, place: Tensor, temperature: float, apart: float) -> Tensor:
