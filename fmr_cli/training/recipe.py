@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from fmr_cli.errors import FmrError
 from fmr_cli.synthetic.batches import Augment
-
-TABLES = ("augment", "whole")  # keys that are tables of their own
 
 
 class RecipeError(FmrError):
@@ -266,7 +264,7 @@ def _whole(table: dict[str, Any]) -> Recipe:
 
 def _checked(cls: type, table: dict[str, Any]) -> dict[str, Any]:
     """The table's values, each a key of the dataclass and of its default's type."""
-    defaults = {f.name: f.default for f in fields(cls) if f.name not in TABLES}
+    defaults = {f.name: f.default for f in fields(cls) if f.default is not MISSING}  # without tables of their own
     values = {}
     for name, value in table.items():
         if name not in defaults:
