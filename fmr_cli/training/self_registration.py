@@ -20,16 +20,22 @@ from fmr_cli.errors import FmrError
 from fmr_cli.geometry.frames import leave_frames
 from fmr_cli.multiway.consistency import AGREE
 from fmr_cli.multiway.known import Known
+from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
 from fmr_cli.multiway.pipeline import Progress, Survey
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.registration import Options
+from fmr_cli.registration.agreement import agreement
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.refinement import by_geometry, by_planes
 
 BANDS = {"small": (0.1, 0.3), "part": (0.3, 0.6), "much": (0.6, 1.01)}  # overlap; below, hardly a patch is in common
 BLOCK = 8  # scans in a row that are drawn together where there are too many: what follows each other overlaps
 STRIDES = (1, 2, 4, 8)  # between them: a spinning scanner's next scan shows nothing new
+SURE = 0.9  # confidence of a link that others' poses are composed from: once ``align`` says so it is hardly ever wrong
+CYCLES = 3  # triangles that make a link as sure
+TRIANGLE = 1.5  # times AGREE, that three links may lie apart
+CONTRADICTED = 0.2  # of what both scans saw: beyond, a pose is none
 APART = 2.0  # times AGREE, that a pose may move when it is refined
 
 Show = Callable[[Progress], None]
@@ -118,10 +124,9 @@ def register_scans(
 
 
 def overlapping(survey: Survey) -> list[tuple[int, int, np.ndarray, float]]:
-    """(source, target, T between centred frames, overlap) of all pairs in one component that share enough."""
+    """(source, target, T between centred frames, overlap) of all pairs in one part that share enough."""
     found = []
-    for component in survey.components:
-        poses = component.T_component_scan
+    for poses in parts(sure_links(survey)):
         members = sorted(poses)
         for k, j in enumerate(members):
             for i in members[k + 1 :]:
@@ -129,6 +134,45 @@ def overlapping(survey: Survey) -> list[tuple[int, int, np.ndarray, float]]:
                 if survey.possible(i, j) and (shared := survey.overlap(i, j, T)) >= BANDS["small"][0]:
                     found.append((i, j, T, shared))
     return found
+
+
+def sure_links(survey: Survey) -> list[Link]:
+    """The links that poses may be composed from, surest first: a wrong one would put whole parts in the wrong place.
+
+    Those that ``align`` is SURE of, less those that more triangles deny than confirm, and those that CYCLES of
+    triangles confirm and none denies.
+    """
+    aligned = [link for link in survey.links.values() if link.status == "aligned"]
+    pose = {link.ends: link.T_target_source for link in aligned}
+    pose |= {(j, i): np.linalg.inv(T) for (i, j), T in pose.items()}
+    kept = []
+    for link in aligned:
+        i, j = link.ends
+        moment = survey.description(i, survey.edges[i]).moment
+        off = [
+            float(displacement(pose[k, j] @ pose[i, k], pose[i, j], moment))
+            for k in survey.edges
+            if (i, k) in pose and (k, j) in pose
+        ]
+        agree = sum(d < AGREE * TRIANGLE * link.edge for d in off)
+        deny = len(off) - agree
+        if (link.confidence >= SURE and agree >= deny) or (agree >= CYCLES and not deny):
+            kept.append(link)
+    return sorted(kept, key=lambda link: (-link.confidence, link.ends))
+
+
+def parts(links: list[Link]) -> list[dict[int, np.ndarray]]:
+    """Scans that links join, each part with T_part_scan of its scans; the surest link of two parts decides."""
+    home: dict[int, dict[int, np.ndarray]] = {}
+    for link in links:
+        i, j = link.ends
+        a, b = (home.setdefault(n, {n: np.eye(4)}) for n in (i, j))
+        if a is b:
+            continue
+        T_a_b = a[i] @ np.linalg.inv(link.T_target_source) @ np.linalg.inv(b[j])
+        for n, pose in b.items():
+            a[n], home[n] = T_a_b @ pose, a
+    return list({id(part): part for part in home.values()}.values())
 
 
 def of_all_bands(
@@ -142,7 +186,10 @@ def of_all_bands(
 
 
 def settled(survey: Survey, source: int, target: int, T: np.ndarray, overlap: float) -> Placed | None:
-    """The pair at its own registered pose where it has one that agrees, else where the surfaces fit next to ``T``."""
+    """The pair at its own registered pose where it has one that agrees, else where the surfaces fit next to ``T``.
+
+    None where they contradict each other there.
+    """
     moment = survey.description(source, survey.edges[source]).moment
     link = survey.links.get((max(source, target), min(source, target)))
     own = [h.T_target_source for h in link.hypotheses] if link is not None and link.status == "aligned" else []
@@ -155,7 +202,9 @@ def settled(survey: Survey, source: int, target: int, T: np.ndarray, overlap: fl
     reach = AGREE * APART * pair.edge
     near = [pose for pose in own if float(displacement(pose, T, moment)) < reach]
     pose = near[0] if near else by_geometry(pair, by_planes(pair, T))
-    if float(displacement(pose, T, moment)) >= reach:
+    fit = agreement(pair.s, pair.t, pose)
+    against = fit.contradicted / max(fit.explained + fit.contradicted, 1)
+    if float(displacement(pose, T, moment)) >= reach or against > CONTRADICTED:
         return None
     files = leave_frames(pose, survey.frames[source], survey.frames[target])
     return Placed(source, target, files.tolist(), overlap, pair.edge, bool(near))
@@ -164,7 +213,7 @@ def settled(survey: Survey, source: int, target: int, T: np.ndarray, overlap: fl
 def in_words(survey: Survey, pairs: list[Placed]) -> str:
     """What a round has found."""
     aligned = sum(link.status == "aligned" for link in survey.links.values())
-    together = [len(c.T_component_scan) for c in survey.components if len(c.T_component_scan) > 1]
+    together = [len(part) for part in parts(sure_links(survey))]
     if not pairs:
         return (
             f"{len(survey.edges)} scans, {len(survey.links)} pairs registered: none is sure to show one place; "
