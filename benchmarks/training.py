@@ -113,20 +113,15 @@ def make(kind: str, out: Path, seed: int) -> list[Case]:
             names.append(folder / f"scan_{number:03d}.ply")
             write_cloud(names[-1], PointCloud(transform_points(T, points)))
             poses.append(T)
-        found = []
+        found, edges = [], [prepare(PointCloud(points)).edge for points in clouds]  # of about 5,000 voxels
         for i, j in combinations(range(1, PLACES, 2), 2):
-            shared = min(overlap(clouds[i], clouds[j], 1.5 * cell(clouds[i], clouds[j])))
+            shared = min(overlap(clouds[i], clouds[j], 1.5 * max(edges[i], edges[j])))
             if shared >= 0.1:
                 T = poses[j] @ np.linalg.inv(poses[i])
                 found.append({"source": str(names[i]), "target": str(names[j]), "T_target_source": T.tolist(),
                               "overlap": shared})  # fmt: skip
         cases.write_text(json.dumps(found))
     return [Case(**case) for case in json.loads(cases.read_text())]
-
-
-def cell(a: np.ndarray, b: np.ndarray) -> float:
-    """A voxel edge at which both scans have about 5,000 voxels."""
-    return max(prepare(PointCloud(x)).edge for x in (a, b))
 
 
 @cache
