@@ -39,7 +39,7 @@ from fmr_cli.synthetic.contradicting import lump
 from fmr_cli.synthetic.scenes import Scene, scan, street
 from fmr_cli.synthetic.sensors import overlap
 
-PLACES, OFFICES = 60, 4  # scans of a place; offices of the building that they are taken in
+PLACES, OFFICES = 60, 2  # scans of a place; offices of the building that they are taken in
 BANDS = {"10 to 30 %": (0.1, 0.3), "30 to 60 %": (0.3, 0.6)}
 DEGREES, SHARE = 5.0, 0.02  # right within
 VIEW = 70.0  # degrees, of the solid-state LiDAR
