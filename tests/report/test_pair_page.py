@@ -123,10 +123,10 @@ def test_plane_errors_are_the_offset_between_two_planes():
     assert target.spacing == 1
     assert target.noise == 0
     inner = grid[(np.abs(grid[:, :2] - 30) < 20).all(1)]
-    at = target.residuals(inner + [0.3, 0.4, 0.25], 3.0)
+    at = target.residuals([*inner, 0.3, 0.4, 0.25], 3.0)
     np.testing.assert_allclose(at.plane, 0.25, atol=1e-9)
     np.testing.assert_allclose(at.point, np.sqrt(0.25 + 0.0625), atol=1e-9)
-    far = target.residuals(inner[:3] + [0, 0, 9.0], 3.0)
+    far = target.residuals([*inner[:3], 0, 0, 9.0], 3.0)
     assert np.isinf(far.point).all()
     assert np.isinf(far.plane).all()
 
