@@ -40,6 +40,10 @@ def align_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the metrics to stdout, not the matrix.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
     bin_columns: BinColumns = None,
+    target_bounds: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(metavar="X Y Z X Y Z", help="Only the part of the target between two corners, low and high."),
+    ] = None,
     verbose: Verbose = 0,
 ) -> None:
     """Find the transform that moves SOURCE onto TARGET."""
@@ -58,17 +62,28 @@ def align_command(
         from fmr_cli.registration.prepared import AT_MOST
 
         named = columns(bin_columns)
+        boxes = (None, target_bounds)
         moving, fixed = (
-            io.read_cloud(path, attributes=False, at_most=AT_MOST, bin_columns=named) for path in (source, target)
+            io.read_cloud(path, attributes=False, at_most=AT_MOST, bin_columns=named, bounds=box)
+            for path, box in zip((source, target), boxes, strict=True)
         )
         with quick_imports():  # after reading: a bad file is said at once
             from fmr_cli.registration import align, export
-        found = align(moving, fixed, options)
+            from fmr_cli.registration.mirror import HINT as MIRRORED
+            from fmr_cli.registration.pipeline import mirror_fits
+        found = align(moving, fixed, options, check=bool(metrics or as_json or verbose))
+        if found.status != "aligned" and not options.allow_mirror:
+            fits = mirror_fits(moving, fixed, options)
+            found.warnings += [] if fits is None else [MIRRORED.format(fits)]
     T, said, warnings = found.T_target_source, export.metrics(moving, fixed, found), [*found.warnings]
-    files = [io.open_cloud(path, bin_columns=named) for path in (source, target)]
+    files = [
+        io.open_cloud(path, bin_columns=named, bounds=box) for path, box in zip((source, target), boxes, strict=True)
+    ]
     if aligned:
         with points_bar("writing the moved source", quiet) as count:
-            cloud = export.aligned_cloud(files[0], io.open_cloud(target, attributes=False, bin_columns=named), T)
+            cloud = export.aligned_cloud(
+                files[0], io.open_cloud(target, attributes=False, bin_columns=named, bounds=target_bounds), T
+            )
             warnings += io.write_cloud(aligned, count(cloud))
     if merged:
         with points_bar("writing both clouds", quiet) as count:

@@ -18,6 +18,7 @@ from fmr_cli.cli.align import align_command
 from fmr_cli.cli.batch import batch_command
 from fmr_cli.cli.console import BAD_INPUT, complain
 from fmr_cli.cli.evaluate import evaluate_command
+from fmr_cli.cli.example import example_command
 from fmr_cli.cli.info import info_command
 from fmr_cli.cli.multiway import multiway_command
 from fmr_cli.cli.options import Debug, takes_debug
@@ -42,6 +43,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "view": view_command,
     "train": train_command,
     "evaluate": evaluate_command,
+    "example": example_command,
 }
 for name, command in COMMANDS.items():
     app.command(name)(takes_debug(command))
