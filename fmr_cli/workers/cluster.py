@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import logging
 import platform
+import signal
 import socket
 import sys
+import threading
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import fmr_cli
@@ -79,9 +81,11 @@ class DaskWorkers:
         if isinstance(self.address, distributed.Client):
             self.client = self.address
         elif self.address == "local":
-            self.cluster = distributed.LocalCluster(
-                n_workers=self.wanted or usable_cores(), threads_per_worker=1, dashboard_address="127.0.0.1:0",
-            )  # fmt: skip
+            with deaf_to_interrupts():  # Ctrl-C ends this process, which ends the workers
+                self.cluster = distributed.LocalCluster(
+                    n_workers=self.wanted or usable_cores(), threads_per_worker=1,
+                    dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
+                )  # fmt: skip
             self.client = distributed.Client(self.cluster, timeout=CONNECT, set_as_default=False)
         else:
             check_address(self.address)
@@ -116,6 +120,8 @@ class DaskWorkers:
 
     def look_at_workers(self) -> set[str]:
         """Asks the scheduler which workers there are, at most every LOOK seconds, and new ones what they have."""
+        if self.client.status == "closed":
+            raise self.lost()
         now = time.monotonic()
         if now - self.looked >= LOOK or not self.fit:
             there = self.ask_scheduler(lambda: self.client.nthreads(callback_timeout=CONNECT))
@@ -182,13 +188,14 @@ class DaskWorkers:
         except (OSError, TimeoutError, CancelledError, RuntimeError, AttributeError):  # the last two: while it closes
             self.unheard = self.unheard or time.monotonic()
             if self.client.status == "closed" or time.monotonic() - self.unheard > CONNECT:
-                raise FmrError(
-                    f"--dask {self.name}: lost the connection to the scheduler; what is written stays"
-                ) from None
+                raise self.lost() from None
             time.sleep(0.2)
             return None
         self.unheard = None
         return answer
+
+    def lost(self) -> FmrError:
+        return FmrError(f"--dask {self.name}: lost the connection to the scheduler; what is written stays")
 
     # The work.
 
@@ -206,9 +213,15 @@ class DaskWorkers:
 
     def submit(self, function: Callable, argument: Any, to: set[str]) -> Any:
         """A future of function(argument) on one of these workers."""
-        return self.client.submit(
-            function, argument, key=f"fmr-{uuid.uuid4().hex}", pure=False, workers=sorted(to), allow_other_workers=False
-        )
+        key = f"fmr-{uuid.uuid4().hex}"
+        try:
+            return self.client.submit(
+                function, argument, key=key, pure=False, workers=sorted(to), allow_other_workers=False
+            )
+        except Exception:
+            if self.client.status == "closed":
+                raise self.lost() from None
+            raise
 
     def responsive(self) -> set[str]:
         """The workers that can be used and aren't silent; where all are, all."""
@@ -224,6 +237,19 @@ class DaskWorkers:
         with suppress(Exception):
             if futures:
                 self.client.cancel(futures, force=True)
+
+
+@contextmanager
+def deaf_to_interrupts() -> Iterator[None]:
+    """Processes that are started within do not hear Ctrl-C, which goes to all that share a terminal."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def what_is_here() -> dict[str, str]:
