@@ -44,7 +44,8 @@ class DaskWorkers:
     """The workers of a scheduler, as a context: it connects, and leaves what others run there alone.
 
     address: of a scheduler, such as tcp://host:8786, or tls://host:8786 with certificates in Dask's configuration;
-    "local" starts a scheduler here with ``count`` worker processes (None: one a core); or a ``distributed.Client``,
+    "local" starts a scheduler here with ``count`` worker processes (None: one a core), in a script to be called under
+    ``if __name__ == "__main__"``, since Dask runs scripts again in its workers; or a ``distributed.Client``,
     which stays open. say: is told the dashboard's address, and what is odd about a worker.
 
     Raises FmrError where Dask is not installed, nobody answers, or no worker can be used.
@@ -92,7 +93,10 @@ class DaskWorkers:
             try:
                 self.client = distributed.Client(self.address, timeout=CONNECT, set_as_default=False)
             except (OSError, ValueError, RuntimeError) as error:
-                raise FmrError(f"--dask {self.address}: no Dask scheduler answers there ({reason(error)})") from None
+                raise FmrError(
+                    f"--dask {self.address}: no Dask scheduler answers there ({reason(error)[:80]}); "
+                    "give another address, or tls:// where it wants TLS"
+                ) from None
         try:
             if self.client.dashboard_link:
                 self.say(f"dashboard: {self.client.dashboard_link}")
