@@ -20,6 +20,7 @@ from fmr_cli.evaluation.baselines import Baseline, gicp, global_baselines, then_
 from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import align
+from fmr_cli.report import plots
 from fmr_cli.synthetic import scenes
 from fmr_cli.synthetic.shapes import shapes
 
@@ -128,16 +129,13 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
     console.print(table)
 
 
-def save(out: Path | None, report: dict[str, Any], draw: Callable[[Any], None]) -> None:
-    """OUT.json with the report, and OUT.png where matplotlib is installed; draw(figure)."""
+def save(out: Path | None, report: dict[str, Any], draw: Callable[[Any], None], height: float = 3.4) -> None:
+    """OUT.json with the report, and OUT.png where matplotlib is installed; draw(figure), so many inches high."""
     if out is None:
         return
     out.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        console.print(f"plot: skipped ({error})")
+    if not plots.can_plot():
+        console.print("plot: skipped (matplotlib is not installed)")
         return
-    figure = Figure((13, 4.6), layout="constrained")
-    draw(figure)
-    figure.savefig(out.with_suffix(".png"), dpi=120)
+    with plots.figure(out.with_suffix(".png"), plots.PAGE, height) as figure:
+        draw(figure)

@@ -25,6 +25,7 @@ from fmr_cli.cli.options import Debug, takes_debug
 from fmr_cli.cli.sequence import sequence_command
 from fmr_cli.cli.train import train_command
 from fmr_cli.cli.transform import transform_command
+from fmr_cli.cli.view import view_command
 from fmr_cli.errors import FmrError
 
 app = typer.Typer(
@@ -39,6 +40,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "sequence": sequence_command,
     "info": info_command,
     "transform": transform_command,
+    "view": view_command,
     "train": train_command,
     "evaluate": evaluate_command,
     "example": example_command,

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from fmr_cli.cli.console import STOPPED, UNCERTAIN, progress, quick_imports, say, show_log
-from fmr_cli.cli.options import Dask, Quiet, Verbose, chosen_workers, takes_registration_options
+from fmr_cli.cli.console import STOPPED, UNCERTAIN, busy, progress, quick_imports, say, show_log
+from fmr_cli.cli.options import Dask, Quiet, Report, Verbose, check_report, chosen_workers, takes_registration_options
 from fmr_cli.registration.options import Options
 
 
@@ -29,6 +29,7 @@ def batch_command(
         int | None, typer.Option(min=1, help="Pairs at a time; one a core if not given.", show_default=False)
     ] = None,
     dask: Dask = None,
+    report: Report = None,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
@@ -36,6 +37,7 @@ def batch_command(
     from collections import Counter
 
     show_log(verbose)
+    check_report(report)
     with quick_imports():
         from fmr_cli.batch import align_batch
 
@@ -54,6 +56,11 @@ def batch_command(
         except KeyboardInterrupt:
             say(f"stopped; what is done is kept in {out}, --resume goes on", quiet=quiet)
             raise typer.Exit(STOPPED) from None
+    if report:
+        with busy("writing the report", quiet):
+            from fmr_cli.report.batch_page import write_batch
+
+            write_batch(report, manifest.parent, out, rows)
     count = Counter(row["status"] for row in rows)
     said = ", ".join(f"{count[status]} {status}" for status in ("aligned", "uncertain", "failed"))
     say(f"{said}: {out / 'results.csv'}", quiet=quiet)

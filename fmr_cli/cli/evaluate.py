@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from fmr_cli.cli.console import progress, say, warn
-from fmr_cli.cli.options import Dask, Quiet, chosen_workers
+from fmr_cli.cli.options import Dask, Quiet, Report, check_report, chosen_workers
 from fmr_cli.errors import FmrError
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def evaluate_command(
     dask: Dask = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same pairs.", min=0)] = 0,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where the encoder runs.")] = "auto",
+    report: Report = None,
     quiet: Quiet = False,
 ) -> None:
     """Measure recall, errors, the verdict and seconds: `fmr align`, the solver alone, and others beside them.
@@ -89,9 +90,12 @@ def evaluate_command(
     from fmr_cli.evaluation.datasets import recognised
     from fmr_cli.evaluation.plan import Compared, OnDataset, OnScans, absolute
 
+    check_report(report)
     if dataset and experiments:
         raise FmrError("--dataset and --experiments: give one of the two; the experiments draw pairs of their own")
     name = dataset or (None if experiments else recognised(scans))
+    if name and report:
+        raise FmrError(f"--report shows experiments; what {name} gives is in results.csv and errors.png: leave it out")
     chosen = [] if name else chosen_experiments(experiments or EXPERIMENTS)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -105,9 +109,15 @@ def evaluate_command(
         if name:
             run_dataset(OnDataset(name, absolute(scans), compared, pairs), team, out, quiet)
         else:
-            run_experiments(
-                chosen, OnScans(absolute(scans), compared, clouds, pairs or PAIRS, points), team, out, quiet
-            )
+            plan = OnScans(absolute(scans), compared, clouds, pairs or PAIRS, points)
+            rows = run_experiments(chosen, plan, team, out, quiet)
+    if report:
+        from fmr_cli.report.evaluation_page import write_evaluation
+
+        said = {"scans": ", ".join(map(str, scans)), "methods": ", ".join(dict.fromkeys(row.method for row in rows))}
+        write_evaluation(
+            report, rows, said | {"pairs": plan.pairs, "points": points, "iterations": iterations, "seed": seed}
+        )
     say(f"written to {out}", quiet=quiet)
 
 
@@ -116,7 +126,7 @@ def run_dataset(plan: OnDataset, team: int | Workers | None, out: Path, quiet: b
     from fmr_cli.evaluation.benchmark import summarise
     from fmr_cli.evaluation.quoted import quoted
     from fmr_cli.report.benchmark import plot, table, write_pairs, write_results
-    from fmr_cli.report.evaluation import can_plot
+    from fmr_cli.report.plots import can_plot
     from fmr_cli.workers.local import on_this_machine
 
     data, _, missing = plan.made()
@@ -154,10 +164,11 @@ def run_pairs(plan: OnDataset, team: Workers, quiet: bool) -> list[Outcome]:
     return rows
 
 
-def run_experiments(chosen: list[str], plan: OnScans, team: int | Workers | None, out: Path, quiet: bool) -> None:
+def run_experiments(chosen: list[str], plan: OnScans, team: int | Workers | None, out: Path, quiet: bool) -> list[Row]:
     """The paper's experiments on folders of scans: tables printed, results.csv and plots in ``out``."""
     from fmr_cli.evaluation.experiments import EXPERIMENTS
-    from fmr_cli.report.evaluation import can_plot, plot, table, write_csv
+    from fmr_cli.report.evaluation import plot, table, write_csv
+    from fmr_cli.report.plots import can_plot
     from fmr_cli.workers.local import on_this_machine
 
     sets, _, missing = plan.made()
@@ -178,6 +189,7 @@ def run_experiments(chosen: list[str], plan: OnScans, team: int | Workers | None
             plot(out / f"{name}.png", experiment, found)
         rows += found
         write_csv(out / "results.csv", rows)
+    return rows
 
 
 def chosen_experiments(text: str) -> list[str]:

@@ -65,7 +65,7 @@ def discount_what_is_seen_through(survey: Survey) -> None:
 
     def shares(pair: Ends) -> list[float]:
         promising = [x for x in every(survey.looks[pair]) if x.promise >= PROMISING]
-        return [survey.seen_through(*pair, x.T_target_source) for x in promising]
+        return [survey.seen_through([(*pair, x.T_target_source)]) for x in promising]
 
     seen = dict(zip(pairs, survey.each("comparing views", shares, pairs), strict=True))
     telling = visibility.from_one_place(((p, min(found)) for p, found in seen.items()), ROUGHLY_ONE_PLACE)
@@ -77,8 +77,12 @@ def discount_what_is_seen_through(survey: Survey) -> None:
 
 
 def untried(survey: Survey, start: str, least: float = PROMISING) -> list[Ends]:
-    """Pairs of that promise which have not been registered from this kind of start, best first."""
-    pairs = [p for p, x in survey.looks.items() if x.promise >= least and (*p, start) not in survey.tried]
+    """Pairs of that promise which have not been registered from this kind of start, best first.
+
+    A look gives up the poses that have been tried, and its promise with them; of other starts a pair has one.
+    """
+    pairs = [p for p, x in survey.looks.items() if x.promise >= least]
+    pairs = [p for p in pairs if start == "look" or (*p, start) not in survey.tried]
     return sorted((p for p in pairs if p not in survey.never), key=lambda p: (-survey.looks[p].promise, p))
 
 

@@ -26,6 +26,7 @@ DENIALS = (
 )  # at so much overlap a link that found nothing is e^-x as likely if the join is right
 RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
 DENIED = 6.0  # log odds that a join loses by each link at whose pose one scan sees through the other
+MET = 10  # pairs of scans of two components whose views are compared before these are joined
 CERTAIN = 12.0  # log odds, at most, of one hypothesis
 
 
@@ -118,10 +119,12 @@ def joined(
     moments: dict[int, np.ndarray],
     overlap: Callable[[int, int, np.ndarray], float],
     fixed: Component | None = None,
+    seen_through: Callable[[list[tuple[int, int, np.ndarray]]], float] = lambda pairs: 0.0,
 ) -> tuple[list[Component], dict[tuple[int, int], Join]]:
     """Components of ``count`` scans, largest first, and the best join of each two that stay apart, by their places.
 
-    overlap: of two scans (source, target) at a pose. fixed: scans whose poses are given.
+    overlap: of two scans (source, target) at a pose. fixed: scans whose poses are given. seen_through: the share of the
+    scans of some pairs, each (source, target, pose), that the other one sees through.
     """
     components = {i: Component({i: np.eye(4)}) for i in range(count)}
     home = list(range(count))
@@ -131,7 +134,7 @@ def joined(
             del components[i]
             home[i] = first
         components[first] = Component(dict(fixed.T_component_scan), set(fixed.held))
-    every = claims(links, moments)
+    every, scans = claims(links, moments), telling(links)
     between: dict[tuple[int, int], list[Claim]] = defaultdict(list)
     for claim in every:
         a, b = sorted((home[links[claim.link].source], home[links[claim.link].target]))
@@ -155,6 +158,11 @@ def joined(
         _, a, b = max(sure)
         a, b = -a, -b
         T = joins[a, b].T_second_first
+        met = meeting(components[a], components[b], T, scans, moments)
+        given = any(links[n].start == "known" for n in joins[a, b].links)
+        if not given and seen_through(met) > CONTRADICTED:
+            joins[a, b] = replace(joins[a, b], denied=joins[a, b].denied + len(met), sound=False)
+            continue
         if components[b].held or (
             not components[a].held and len(components[b].T_component_scan) > len(components[a].T_component_scan)
         ):
@@ -181,6 +189,19 @@ def joined(
     place = {c: n for n, c in enumerate(order)}
     left = {(min(place[a], place[b]), max(place[a], place[b])): join for (a, b), join in joins.items()}
     return [components[c] for c in order], left
+
+
+def meeting(
+    first: Component, second: Component, T_second_first: np.ndarray, scans: set[int], moments: dict[int, np.ndarray]
+) -> list[tuple[int, int, np.ndarray]]:
+    """Pairs of two components at a join, each (source, target, pose), that lie closest for their size; of ``scans``."""
+    pairs = []
+    for i in sorted(scans & first.T_component_scan.keys()):
+        for j in sorted(scans & second.T_component_scan.keys()):
+            T = np.linalg.inv(second.T_component_scan[j]) @ T_second_first @ first.T_component_scan[i]
+            size = np.sqrt(np.trace(moments[i][:3, :3])) + np.sqrt(np.trace(moments[j][:3, :3]))
+            pairs.append((float(np.linalg.norm(T[:3, 3]) / size), i, j, T))
+    return [(i, j, T) for near, i, j, T in sorted(pairs, key=lambda p: p[:3])[:MET] if near < 1]
 
 
 def rekeyed(table: dict[tuple[int, int], list], gone: int, keep: int) -> set[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from fmr_cli.geometry.frames import Frame, enter_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.multiway import consistency, looks, visibility
 from fmr_cli.multiway.consistency import Component, Join
-from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of
+from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of, poses_in_file
 from fmr_cli.multiway.links import Journal, Link
 from fmr_cli.multiway.pose_graph import Prior
 from fmr_cli.multiway.scans import Scan
@@ -74,6 +74,7 @@ class Survey:
         self.edges: dict[int, float] = {}
         self.described: dict[tuple[int, float], looks.Description] = {}
         self.views: dict[int, visibility.Viewed] = {}
+        self.through: dict[tuple[int, int, bytes], tuple[int, int]] = {}  # what has been compared already
         self.looks: dict[Ends, looks.Look] = {}
         self.links: dict[Ends, Link] = {}
         self.tried: set[tuple[int, int, str]] = set()
@@ -83,7 +84,9 @@ class Survey:
         self.journal = Journal(None if out is None else out / "journal.jsonl", self.settings())
         self.fixed_numbers = [number_of(name, scans, "--fixed") for name in dict.fromkeys(known.fixed)]
         self.anchor = None if known.anchor is None else number_of(known.anchor, scans, "--anchor")
-        self.poses = {number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()}
+        self.poses = poses_in_file([scan.path for scan in scans]) | {
+            number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()
+        }
         self.never: set[Ends] = set()
         self.asked: list[tuple[int, int, np.ndarray | None]] = []  # "try" and "known" links: source, target, pose
         self.given: list[tuple[int, int, np.ndarray]] = []
@@ -181,9 +184,15 @@ class Survey:
             return 0.0
         return looks.overlap(a, b, T_target_source)
 
-    def seen_through(self, source: int, target: int, T_target_source: np.ndarray) -> float:
-        """The share of one scan that the other one sees through at a pose."""
-        return visibility.contradiction(self.viewed(source), self.viewed(target), T_target_source)
+    def seen_through(self, pairs: Iterable[tuple[int, int, np.ndarray]]) -> float:
+        """The share of the points of pairs (source, target, pose) that the other scan sees through, all together."""
+        counts = []
+        for source, target, T in pairs:
+            key = (source, target, T.tobytes())
+            if key not in self.through:
+                self.through[key] = visibility.contradiction(self.viewed(source), self.viewed(target), T)
+            counts.append(self.through[key])
+        return sum(x for x, _ in counts) / max(sum(said for _, said in counts), 1)
 
     def motion(self, source: int, target: int, unit: float = 1.0) -> Motion:
         """What may move between two centred frames, lengths in ``unit``."""
