@@ -27,6 +27,7 @@ from fmr_cli.errors import FmrError
 from fmr_cli.workers.base import Answer, LostError, Task, forget
 
 CONNECT = 10.0  # s that a scheduler has to answer, and to come back after the connection was lost
+UNHEARD = 60.0  # s of silence of a scheduler whose connection holds: it is busy, or stopped
 NO_WORKERS = 60.0  # s to wait for a first worker, or for another one when all are gone
 LOOK = 2.0  # s between two looks at which workers there are
 LIBRARIES = ("numpy", "scipy", "small_gicp")  # whose versions may change the last bits of a result
@@ -186,12 +187,15 @@ class DaskWorkers:
         self.say(f"worker {address} is left out: it {why}")
 
     def ask_scheduler(self, question: Callable[[], Any]) -> Any:
-        """What the scheduler says, or None where it does not; after CONNECT seconds of silence a FmrError."""
+        """What the scheduler says, or None where it does not; a FmrError after UNHEARD s, or once the client is closed.
+
+        A client whose connection is lost closes itself after CONNECT seconds of trying again.
+        """
         try:
             answer = question()
         except (OSError, TimeoutError, CancelledError, RuntimeError, AttributeError):  # the last two: while it closes
             self.unheard = self.unheard or time.monotonic()
-            if self.client.status == "closed" or time.monotonic() - self.unheard > CONNECT:
+            if self.client.status == "closed" or time.monotonic() - self.unheard > UNHEARD:
                 raise self.lost() from None
             time.sleep(0.2)
             return None
