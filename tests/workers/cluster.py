@@ -51,7 +51,7 @@ class Cluster:
             process.wait()
 
 
-def wait_for(condition, seconds: float = 30.0) -> None:
+def wait_for(condition, seconds: float = 120.0) -> None:
     """Until a condition holds; an AssertionError after so long."""
     end = time.monotonic() + seconds
     while not condition():

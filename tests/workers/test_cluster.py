@@ -42,7 +42,7 @@ def shared(tmp_path_factory):
         for first in ("", "", WRONG_VERSION):
             found.worker(first)
         with distributed.Client(found.address, set_as_default=False) as client:
-            client.wait_for_workers(3, timeout=60)
+            client.wait_for_workers(3, timeout=120)
         yield found
 
 
@@ -52,7 +52,7 @@ def impatient(monkeypatch):
     monkeypatch.setattr(handing, "SLOWER", 1.5)
     monkeypatch.setattr(handing, "TICK", 0.1)
     monkeypatch.setattr(cluster, "LOOK", 0.2)
-    monkeypatch.setattr(cluster, "CONNECT", 5.0)
+    monkeypatch.setattr(cluster, "CONNECT", 10.0)
 
 
 def have(workers: DaskWorkers, count: int) -> None:
@@ -87,7 +87,7 @@ def test_closing_gives_up_what_is_under_way(shared):
         answers = workers.run(work.slow, range(50))
         next(answers)
         answers.close()
-        wait_for(lambda: not any(workers.client.processing().values()), 10)
+        wait_for(lambda: not any(workers.client.processing().values()))
 
 
 def test_a_client_that_is_given_stays_open(shared):
@@ -201,7 +201,7 @@ def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monke
         monkeypatch.setattr(cluster, "NO_WORKERS", 0.5)
         with pytest.raises(FmrError, match="it has no workers"), DaskWorkers(alone.address):
             pass
-        monkeypatch.setattr(cluster, "NO_WORKERS", 30)
+        monkeypatch.setattr(cluster, "NO_WORKERS", 120)
         without = alone.worker(WITHOUT_FMR)
         with (
             pytest.raises(FmrError, match=r"none of 1 workers can be used; .* lacks fmr_cli"),
@@ -217,7 +217,7 @@ def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monke
             begin = time.monotonic()
             with pytest.raises(FmrError, match="lost the connection"):
                 list(answers)
-            assert time.monotonic() - begin < 4 * cluster.CONNECT
+            assert time.monotonic() - begin < 10 * cluster.CONNECT
 
 
 @pytest.mark.parametrize(
