@@ -142,7 +142,9 @@ class Drive:
             yield PointCloud(np.concatenate(found), {"time": np.concatenate(times)})
 
 
-def round_corners(size: tuple[float, float], every: float, rng: np.random.Generator, stray: float, z: float) -> np.ndarray:
+def round_corners(
+    size: tuple[float, float], every: float, rng: np.random.Generator, stray: float, z: float
+) -> np.ndarray:
     """Corners of a way round a rectangle, ``every`` so far, each off it by up to ``stray``."""
     (a, b), corners = size, []
     for start, end in (((-a, -b), (a, -b)), ((a, -b), (a, b)), ((a, b), (-a, b)), ((-a, b), (-a, -b))):
