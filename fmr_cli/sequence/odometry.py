@@ -47,6 +47,7 @@ FINEST = 0.05
 # Voxels: an unobserved direction whose sigma is beyond it could matter. Half the voxel that everything here is measured
 # by: 0.05 m for a depth camera in a room, 0.2 m for a LiDAR in a street.
 MATTERS = 0.5
+ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
 
@@ -192,8 +193,8 @@ class Odometry:
     def _polished(self, scan: PreparedScan, fit: Fit, expected: Expected) -> Fit:
         """The fit's exact pose; along directions that are not observed, the prediction's.
 
-        Two things can show that such a direction is observed after all: the scan does not fit there, or there all of
-        it is observed.
+        Three things can show that such a direction is observed after all: a pose further off fits and is observed in
+        all directions; the scan does not fit at the prediction; or there all of it is observed.
         """
         assert self.motion
         usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
@@ -202,6 +203,9 @@ class Odometry:
             self.slopes.append(slope)
         if fit.seen is None or fit.seen.observed.all():
             return fit
+        elsewhere = self._observed_elsewhere(scan, fit, expected, usual_slope)
+        if elsewhere is not None:
+            return elsewhere
         held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, expected, fit.seen))
         there, _ = self.map.polish(scan, held, usual_slope)
         if there.seen is None:
@@ -211,6 +215,19 @@ class Odometry:
         if there.rms > WORSE * max(fit.rms, FINEST):
             return replace(fit, seen=fit.seen.as_observed())
         return replace(there, T_map_scan=self.motion.combined(there.T_map_scan, expected, there.seen))
+
+    def _observed_elsewhere(self, scan: PreparedScan, fit: Fit, expected: Expected, slope: float) -> Fit | None:
+        """A pose found from further off that fits about as well and leaves nothing open.
+
+        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing.
+        """
+        other = self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)
+        if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
+            return None
+        if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
+            return None
+        other, _ = self.map.polish(scan, other, slope)
+        return other if other.seen is not None and other.seen.observed.all() else None
 
     def _accept(self, index: int, scan: PreparedScan, expected: Expected, fit: Fit) -> None:
         """Take the fit as the pose, and the scan into the map where it has moved on or the map has grown stale."""
