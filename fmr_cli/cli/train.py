@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fmr_cli.cli.console import err, progress, say, warn
-from fmr_cli.cli.options import Topic
+from fmr_cli.cli.options import Report, Topic, check_report
 from fmr_cli.errors import FmrError
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ def train_command(
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same weights (CPU).", min=0)] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to train.")] = "auto",
     topic: Topic = None,
+    report: Report = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
 ) -> None:
     """Learn an encoder from SCANS, starting from the bundled one; see what it gained.
@@ -60,6 +61,7 @@ def train_command(
     from fmr_cli.io.parts import with_topic
     from fmr_cli.training.run import prepare, settings
 
+    check_report(report)
     scans = [with_topic(path, topic) for path in scans or []] or None
 
     if resume and (unsupervised or semi_supervised or recipe or start or learning_rate is not None or seed is not None):
@@ -83,6 +85,10 @@ def train_command(
         say(f"learning from {'; '.join(trainer.task.described)}", quiet=quiet)
         bar.update(task, description="testing", total=None, said="what is held out, before training")
         stopped = learn(trainer, partial(bar.update, task), quiet)
+    if report and trainer.rank == 0 and trainer.progress.scores:
+        from fmr_cli.report.training_page import write_training
+
+        write_training(report, trainer, stopped)
     if not quiet:
         conclude(trainer, stopped)
 

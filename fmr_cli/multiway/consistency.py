@@ -66,12 +66,12 @@ class Claim:
 def log_odds(h: Hypothesis, one_place: bool) -> float:
     """Of one hypothesis: what ``align`` says, less what one scan sees through at it, where that tells anything."""
     c = min(max(h.confidence, 1e-9), 1 - 1e-9)
-    return float(np.clip(np.log(c / (1 - c)), -CERTAIN, CERTAIN)) - (doubt(h.seen_through) if one_place else 0.0)
+    return float(np.clip(np.log(c / (1 - c)), -CERTAIN, CERTAIN)) - (doubt(h.seen_through or 0.0) if one_place else 0.0)
 
 
 def telling(links: list[Link]) -> set[int]:
     """The scans whose views tell right poses from wrong ones, by their links."""
-    seen = [(x.ends, x.hypotheses[0].seen_through) for x in links if x.status == "aligned" and x.hypotheses]
+    seen = [(x.ends, x.hypotheses[0].seen_through or 0.0) for x in links if x.status == "aligned" and x.hypotheses]
     return from_one_place(seen, ONE_PLACE)
 
 
@@ -101,7 +101,7 @@ def claims(links: list[Link], moments: dict[int, np.ndarray]) -> list[Claim]:
                         agreed = np.where(off < reach, odds - np.log(CHANCE), 0.0)
                         best = max(best, float(agreed.max()))
                 support += best
-            contradicted = link.source in scans and h.seen_through >= CONTRADICTED
+            contradicted = link.source in scans and (h.seen_through or 0.0) >= CONTRADICTED
             found.append(Claim(number, choice, alone[number][choice] + min(support, CERTAIN), contradicted))
     return found
 

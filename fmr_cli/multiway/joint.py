@@ -7,18 +7,17 @@ taken at the common solution, weighted by its own noise, and only in the directi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from fmr_cli.geometry.motion import Motion, exp
-from fmr_cli.geometry.normals import neighbours, normals_and_variation
 from fmr_cli.geometry.observability import WEAK
 from fmr_cli.geometry.point_to_plane import point_to_plane
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.multiway.pose_graph import EXACT, Prior, adjoint
+from fmr_cli.multiway.workers import Workers
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 
 FINER = 2.0  # times the grid on which pairs are registered
@@ -67,11 +66,10 @@ class System:
 def view(scan: Prepared, edge: float) -> View:
     """The scan on voxels of ``edge`` over FINER, or as fine as its spacing allows."""
     fine = min(max(edge / FINER, SPACINGS * scan.spacing), edge)
-    points = scan.surface(fine).points
-    tree = cKDTree(points)
-    normals = normals_and_variation(points, *neighbours(points, tree))[0]
+    surface = scan.surface(fine)
+    points = surface.points
     some = sample(np.arange(len(points)), POINTS, np.random.default_rng(scan.seed))
-    return View(fine, points, normals, tree, some, float(np.sqrt((points**2).sum(1).mean())))
+    return View(fine, points, surface.normals, surface.tree, some, float(np.sqrt((points**2).sum(1).mean())))
 
 
 def partners(
@@ -93,7 +91,7 @@ def refine(
     pairs: list[tuple[int, int]],
     held: set[int],
     motion: Motion,
-    pool: Executor,
+    workers: Workers,
     priors: Iterable[Prior] = (),
 ) -> Refined:
     """The poses at which all pairs fit best at once. held: scans that don't move; priors: poses known beforehand."""
@@ -112,7 +110,7 @@ def refine(
             )
 
         both = [pair for i, j in pairs for pair in ((i, j), (j, i))]
-        systems = [s for s in pool.map(system, both) if s is not None]
+        systems = [s for s in workers.map(system, both) if s is not None]
         if not systems or not free:
             break
         floor = float(np.median([s.variance for s in systems])) / 9

@@ -34,7 +34,7 @@ class Description:
 
     edge: of the voxels. keypoints (K, 3), descriptors (K, d). points (M, 3), normals (M, 3), tree: of the voxels.
     some: SAMPLE of their rows. moment: (4, 4) mean of homogeneous x xᵀ, which says how far two poses move the scan
-    apart (``displacement``).
+    apart (``displacement``). reach: of the point that is furthest from the centre.
     """
 
     edge: float
@@ -45,6 +45,7 @@ class Description:
     tree: cKDTree
     some: np.ndarray
     moment: np.ndarray
+    reach: float
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,10 @@ def describe(scan: Prepared, edge: float) -> Description:
     points = surface.points
     some = sample(np.arange(len(points)), SAMPLE, np.random.default_rng(scan.seed))
     x = np.hstack([points, np.ones((len(points), 1))])
+    reach = float(np.linalg.norm(points, axis=1).max())
     return Description(
-        edge, keypoints, descriptors, points, surface.normals, surface.tree, some, x.T @ x / len(x)
-    )  # fmt: skip
+        edge, keypoints, descriptors, points, surface.normals, surface.tree, some, x.T @ x / len(x), reach
+    )
 
 
 def shared_edges(own: Sequence[float]) -> list[float]:

@@ -62,11 +62,11 @@ def align(
     where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
     contradict each other.
     """
-    found = as_they_are(source, target, options, threads)
+    found = as_they_are(source, target, options, threads, check)
     if not options.allow_mirror or found.status == "aligned":
         return found
     image = mirror.image(source, options.seed)
-    other = as_they_are(image, target, options, threads)
+    other = as_they_are(image, target, options, threads, check)
     return mirror.undone(other, image.centre) if other.status == "aligned" else found
 
 
@@ -85,7 +85,7 @@ def mirror_fits(source: PointCloud | Prepared, target: PointCloud | Prepared, op
 
 
 def as_they_are(
-    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, threads: int
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, threads: int, check: bool
 ) -> Registration:
     """``align`` without a mirror."""
     time = Stopwatch()
