@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import read_poses
-from fmr_cli.io.files import atomic_write, check_readable
+from fmr_cli.io.files import check_readable
 from fmr_cli.io.transforms import as_transform, number_rows
 
 KITTI_LENGTHS = tuple(range(100, 801, 100))  # m, of the segments; from KITTI's odometry devkit, as is the next
