@@ -25,6 +25,7 @@ from fmr_cli.multiway.scans import Scan
 from fmr_cli.multiway.store import Store
 from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import Options
+from fmr_cli.registration.models import local_encoder
 from fmr_cli.registration.prepared import pair_edge
 from fmr_cli.registration.result import plain
 
@@ -84,6 +85,7 @@ class Survey:
         self.journal = Journal(None if out is None else out / "journal.jsonl", self.settings())
         self.fixed_numbers = [number_of(name, scans, "--fixed") for name in dict.fromkeys(known.fixed)]
         self.anchor = None if known.anchor is None else number_of(known.anchor, scans, "--anchor")
+        self.local = local_encoder(options.model)
         self.poses = poses_in_file([scan.path for scan in scans]) | {
             number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()
         }
@@ -151,7 +153,7 @@ class Survey:
         """What a look needs of a scan, on its own shared grid or one of ``edge``."""
         edge = edge or self.edges[number]
         if (number, edge) not in self.described:
-            self.described[number, edge] = looks.describe(self.store.prepared(number), edge)
+            self.described[number, edge] = looks.describe(self.store.prepared(number), edge, self.local)
         return self.described[number, edge]
 
     def moment(self, number: int) -> np.ndarray:
