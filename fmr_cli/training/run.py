@@ -23,7 +23,7 @@ from fmr_cli.training.loop import Trainer
 from fmr_cli.training.processes import join_processes
 from fmr_cli.training.recipe import AnyRecipe, LocalRecipe, Recipe, ScanRecipe, read_recipe
 from fmr_cli.training.run_folder import CARD, MODEL, RECIPE, STATE, RunFolder, TrainingError
-from fmr_cli.training.scan_task import ScanTask, labelled_pairs
+from fmr_cli.training.scan_task import ROUNDS, ScanTask, labelled_pairs
 from fmr_cli.training.scans import read_pairs
 from fmr_cli.training.task import Task
 
@@ -97,6 +97,7 @@ def prepare(
     folder.make()
     trainer = Trainer(task, out, minutes, resume)
     if trainer.rank == 0 and not resume:
+        (out / ROUNDS).unlink(missing_ok=True)  # of a run that was killed before there was anything to resume
         folder.write(RECIPE, recipe.toml())
     return trainer, warnings
 

@@ -44,8 +44,8 @@ from fmr_cli.training.task import Files, Scores, Show, Task, ramped_cosine
 ROUNDS, CURRENT = "registered.json", "current.safetensors"
 RIGHT = "right matches"  # column of metrics.csv: the share of the matches of two scans that are right
 SCANS, MADE_UP = "held-out scans", "made-up scans"  # what is tested
-FORGOTTEN = 0.02  # of the right matches on made-up scans, that may be lost
-SHARES = {"registered": 0.5, "single": 0.2, "made up": 0.3}  # of a step's pairs, where there are all three
+FORGOTTEN = 0.15  # of the right matches on made-up scans, that may be lost
+SHARES = {"registered": 0.6, "single": 0.15, "made up": 0.25}  # of a step's pairs, where there are all three
 TESTED_KEYPOINTS = 600  # of each scan; all of them take twice the time
 TESTED_MADE_UP = 6  # pairs
 FEWEST_TESTED = 4  # held-out pairs; where there are fewer, parts of held-out scans stand in
@@ -265,7 +265,7 @@ class ScanTask(Task):
     def quality(self, scores: Scores) -> tuple[float, ...]:
         """Right matches on held-out scans; nothing where too many on made-up ones are forgotten."""
         before = self.start_scores.get(MADE_UP, {}).get(RIGHT, 0.0)
-        forgotten = MADE_UP in scores and scores[MADE_UP][RIGHT] < before - FORGOTTEN
+        forgotten = MADE_UP in scores and scores[MADE_UP][RIGHT] < (1 - FORGOTTEN) * before
         return (0.0 if forgotten else scores.get(SCANS, scores[MADE_UP])[RIGHT],)
 
     def may_choose(self, step: int) -> bool:

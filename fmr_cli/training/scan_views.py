@@ -21,7 +21,7 @@ from fmr_cli.training.local_views import Views, between
 
 SCALES = (0.7, 1.0, 1.4, 1.5)  # times the working voxel: those that ``align`` looks at
 JITTER = 0.1  # of the logarithm of a scale
-UNTOUCHED = 0.5  # of the registered pairs stay as they are
+UNTOUCHED = 0.75  # of the registered pairs stay as they are
 LEAST_POINTS = 500  # of a scan or a part of it
 SHARES = 0.15, 0.9  # of the surface, that two parts of one scan share
 HIDDEN = 0.5  # of the parts are seen from a made-up viewpoint
@@ -44,7 +44,7 @@ class Overlapping:
 def drawn_views(
     pair: Overlapping, rng: np.random.Generator, count: int, others: int, touch: bool = True
 ) -> Views | None:
-    """Patches of a pair at one of the scales of ``align``, one of two times as worse sensors would give it."""
+    """Patches of a pair at one of the scales of ``align``, now and then as worse sensors would give it."""
     clouds = [pair.source, pair.target]
     if touch and rng.random() > UNTOUCHED:
         clouds = [degrade(points, rng) for points in clouds]

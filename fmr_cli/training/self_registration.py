@@ -40,8 +40,6 @@ STRIDES = (1, 2, 4, 8)  # between them: a spinning scanner's next scan shows not
 SURE = 0.9  # confidence of a link that others' poses are composed from: once ``align`` says so it is hardly ever wrong
 CYCLES = 3  # triangles that make a link as sure
 TRIANGLE = 1.5  # times AGREE, that three links may lie apart
-CONTRADICTED = 0.2  # of what both scans saw: beyond, a pose is none
-APART = 2.0  # times AGREE, that a pose may move when it is refined
 
 Show = Callable[[Progress], None]
 
@@ -191,9 +189,11 @@ def of_all_bands(
 
 
 def settled(survey: Survey, source: int, target: int, T: np.ndarray, overlap: float) -> Placed | None:
-    """The pair at its own registered pose where it has one that agrees, else where the surfaces fit next to ``T``.
+    """The pair at its own registered pose where it has one that agrees; else at ``T``, which follows from others'.
 
-    None where they contradict each other there.
+    That is refined where enough is shared: of little, surfaces say less than the links of others do (measured on depth
+    views of an object: composed over two links half a voxel off, refined at 15 % overlap five). None where more speaks
+    against the pose than for it.
     """
     moment = survey.description(source, survey.edges[source]).moment
     link = survey.links.get((max(source, target), min(source, target)))
@@ -204,12 +204,14 @@ def settled(survey: Survey, source: int, target: int, T: np.ndarray, overlap: fl
         pair = make_pair(survey.store.prepared(source), survey.store.prepared(target), survey.options)
     except FmrError:
         return None
-    reach = AGREE * APART * pair.edge
-    near = [pose for pose in own if float(displacement(pose, T, moment)) < reach]
-    pose = near[0] if near else by_geometry(pair, by_planes(pair, T))
+    reach = AGREE * pair.edge
+    near = [pose for pose in own if float(displacement(pose, T, moment)) < 2 * reach]
+    pose = near[0] if near else T
+    if not near and overlap >= BANDS["part"][0]:
+        refined = by_geometry(pair, by_planes(pair, T))
+        pose = refined if float(displacement(refined, T, moment)) < reach else T
     fit = agreement(pair.s, pair.t, pose)
-    against = fit.contradicted / max(fit.explained + fit.contradicted, 1)
-    if float(displacement(pose, T, moment)) >= reach or against > CONTRADICTED:
+    if fit.contradicted > fit.explained:
         return None
     files = leave_frames(pose, survey.frames[source], survey.frames[target])
     return Placed(source, target, files.tolist(), overlap, pair.edge, bool(near))
