@@ -1,4 +1,4 @@
-"""docs/formats.md: every line of its table of what is read is an example that is read rightly, and the other way about."""
+"""docs/formats.md: each line of what is read is an example that is read rightly, and the other way about."""
 
 from __future__ import annotations
 
