@@ -3,8 +3,9 @@
     python -m benchmarks.fuzz --count 4000            # as the tests do
     python -m benchmarks.fuzz --minutes 60 --out found/
 
-A file is either read, or refused by a CloudFileError whose one line begins with its path. Anything else is a finding: another
-exception, a crash, more than 2 s of the processor or 500 MB, a native library's line on stderr. Findings go to --out.
+A file is either read, or refused by a CloudFileError whose one line begins with its path. Anything else is a finding:
+another exception, a crash, more than 2 s of the processor or 500 MB, a native library's line on stderr. Findings go to
+--out.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ SECONDS, MEGABYTES = 2.0, 500  # of the processor; of memory beyond what the pro
 LARGEST = 1_000_000  # bytes of a malformed file
 TEXT = (".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".off", ".obj")
 NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 62, (1 << 64) - 1)
-CELLS = ("", "nan", "inf", "-", "1e400", "-0", "1_0", "1,5", "1.5.2", '"', "''", "0x1F", "9" * 400, "1e-400", "\0", "\ufeff",
+CELLS = ("", "nan", "inf", "-", "1e400", "-0", "1_0", "1,5", "1.5.2", '"', "''", "0x1F", "9" * 400, "1e-400", "\0",
+         "\ufeff",
          "x", "-1", "999999999999", "1D+3", "#", ";", "vertex", "0 0", "\u0665", "4294967296")  # fmt: skip
 
 

@@ -2,8 +2,9 @@
 
 A loop is believed where the verdict of ``align`` is "aligned" and the map of the place agrees with it; one that lies
 further off than the path can have drifted only where another one tells the same. They are closed by a pose graph
-(GTSAM), robustly, each with the information that the scan has at the place. Lengths are in voxels and poses are
-T_map_scan, as in ``odometry``.
+(GTSAM), each with the information that the scan has at the place; while one does not fit the closed path, the worst is
+dropped (Baarda's data snooping: a robust kernel would rather believe the path, whose drift is no noise). Lengths are in
+voxels and poses are T_map_scan, as in ``odometry``.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from functools import lru_cache
 import numpy as np
 
 from fmr_cli.multiway import looks
-from fmr_cli.multiway.pose_graph import ROBUST, adjoint, bounded, prior_factor, symmetric
+from fmr_cli.multiway.pose_graph import adjoint, bounded, prior_factor, symmetric
+from fmr_cli.registration.models import local_encoder
 from fmr_cli.sequence.local_map import COARSE, FINE, LocalMap, displacement
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
@@ -106,7 +108,7 @@ def lookalikes(path: np.ndarray, keys: list[int], load: Callable[[int], Prepared
         return []
     from fmr_cli.geometry.motion import Motion
 
-    described = [looks.describe(load(key).for_align, EDGE) for key in keys]
+    described = [looks.describe(load(key).for_align, EDGE, local_encoder()) for key in keys]
     alike = looks.similarity(described)
     found = []
     for later in range(1, len(keys)):
@@ -198,10 +200,7 @@ def optimise(poses: np.ndarray, sure: np.ndarray, loops: list[Loop]) -> np.ndarr
             graph.add(gtsam.BetweenFactorPose3(i - 1, i, step, gtsam.noiseModel.Diagonal.Sigmas(sigma)))
     for loop in loops:
         A = adjoint(loop.T_earlier_later)
-        noise = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST),
-            gtsam.noiseModel.Gaussian.Information(symmetric(A.T @ loop.information @ A)),
-        )
+        noise = gtsam.noiseModel.Gaussian.Information(symmetric(A.T @ loop.information @ A))
         graph.add(gtsam.BetweenFactorPose3(loop.earlier, loop.later, gtsam.Pose3(loop.T_earlier_later), noise))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return np.stack([found.atPose3(i).matrix() for i in range(len(poses))])

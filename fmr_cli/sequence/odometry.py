@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fmr_cli.errors import RegistrationError
+from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.local_map import COARSE, FINE, REACH, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
@@ -46,10 +47,9 @@ FINEST = 0.05
 # Voxels: an unobserved direction whose sigma is beyond it could matter. Half the voxel that everything here is measured
 # by: 0.05 m for a depth camera in a room, 0.2 m for a LiDAR in a street.
 MATTERS = 0.5
+ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
-
-FeatureErrors = tuple[float, float] | None
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,10 @@ class Frame:
     T_first_scan: (4, 4) float64, file units. status: "aligned", or "uncertain": the pose is then the prediction, and
     the scan is kept out of the map. overlap: share of its points with a counterpart on the map. inlier_rmse: their
     root mean square distance from the map's local planes, file units. start: where the accepted pose came from
-    ("first", "prediction", "zero-motion", "features"). feature_errors: before and after, where the feature-metric
-    registration was asked. unobserved: directions along which the scan does not tell its pose, in the first scan's
-    axes ("shift along (1.00, 0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once
-    sigma_shift (file units) or sigma_rotation (degrees), the pose's standard deviations along the worst direction,
-    could matter.
+    ("first", "prediction", "zero-motion", "features"). feature_errors: see ``feature_error``, by the last usable scan.
+    unobserved: directions along which the scan does not tell its pose, in the first scan's axes ("shift along (1.00,
+    0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once sigma_shift (file units) or
+    sigma_rotation (degrees), the pose's standard deviations along the worst direction, could matter.
     """
 
     T_first_scan: np.ndarray
@@ -71,7 +70,7 @@ class Frame:
     overlap: float
     inlier_rmse: float
     start: str
-    feature_errors: FeatureErrors = None
+    feature_errors: tuple[float, float] | None = None
     unobserved: tuple[str, ...] = ()
     sigma_shift: float = 0.0
     sigma_rotation: float = 0.0
@@ -103,13 +102,17 @@ class Odometry:
             return self._begin(index, scan, np.eye(4))
         expected = self.motion.expect(told, pace)
         if scan is None:
-            return self._bridge(index, None, expected, Fit(expected.T_map_scan, 0.0, np.nan, "prediction"), None)
-        fit, feature_errors = self._best_fit(scan, expected)
-        if not self._fits(fit):
-            return self._bridge(index, scan, expected, fit, feature_errors)
-        fit = self._polished(scan, fit, expected)
-        self._accept(index, scan, expected, fit)
-        return self._frame(scan, fit, feature_errors)
+            return self._bridge(index, None, expected, Fit(expected.T_map_scan, 0.0, np.nan, "prediction"))
+        _, last, T_map_last = self.last
+        fit = self._best_fit(scan, expected)
+        if self._fits(fit):
+            fit = self._polished(scan, fit, expected)
+            self._accept(index, scan, expected, fit)
+            frame = self._frame(fit)
+        else:
+            frame = self._bridge(index, scan, expected, fit)
+        T_last_scan = np.linalg.inv(T_map_last) @ self.motion.T_map_scan
+        return replace(frame, feature_errors=feature_errors(last, scan, T_last_scan))
 
     def begin_in_map(self, scan: PreparedScan | None, T_map_guess: np.ndarray | None) -> Frame:
         """The first frame, in the known map: near a guess (4, 4), or found by registration.
@@ -140,7 +143,7 @@ class Odometry:
         self.last, self.aligned = (index, scan, T_map_scan), 1
         return Frame(self.frame.pose_to_file(T_map_scan), "aligned", 1.0, 0.0, "first")
 
-    def _best_fit(self, scan: PreparedScan, next_frame: Expected) -> tuple[Fit, FeatureErrors]:
+    def _best_fit(self, scan: PreparedScan, next_frame: Expected) -> Fit:
         """Trust the prediction while predictions have been good; else compare starts by what they come to.
 
         Where none fits the map, the registration onto the scan before counts, if its verdict is "aligned".
@@ -150,7 +153,7 @@ class Odometry:
         if self.aligned > TRUSTED_AFTER:
             fit = self.map.fit(scan, T_map_predicted, levels(expected), "prediction")
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
-                return fit, None
+                return fit
             fits = [fit]
         assert self.motion
         starts = {"zero-motion": self.motion.T_map_scan}
@@ -160,7 +163,7 @@ class Odometry:
         best = min(fits, key=lambda fit: fit.total)
         same = all(displacement(fit.T_map_scan, best.T_map_scan, scan.points) < FINE / 2 for fit in fits)
         if self._fits(best) and ((len(fits) > 1 and same) or best.total < CONVINCING):
-            return best, None
+            return best
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
         best = min(best, by_features, key=lambda fit: fit.total)
@@ -168,7 +171,7 @@ class Odometry:
             same = displacement(by_features.T_map_scan, T_map_features, scan.points) < FINE
             best = by_features if same else replace(by_features, T_map_scan=T_map_features)
             best = replace(best, verified=True)
-        return best, (found.feature_error_before, found.feature_error_after)
+        return best
 
     def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
@@ -190,8 +193,8 @@ class Odometry:
     def _polished(self, scan: PreparedScan, fit: Fit, expected: Expected) -> Fit:
         """The fit's exact pose; along directions that are not observed, the prediction's.
 
-        Two things can show that such a direction is observed after all: the scan does not fit there, or there all of
-        it is observed.
+        Three things can show that such a direction is observed after all: a pose further off fits and is observed in
+        all directions; the scan does not fit at the prediction; or there all of it is observed.
         """
         assert self.motion
         usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
@@ -200,6 +203,9 @@ class Odometry:
             self.slopes.append(slope)
         if fit.seen is None or fit.seen.observed.all():
             return fit
+        elsewhere = self._observed_elsewhere(scan, fit, expected, usual_slope)
+        if elsewhere is not None:
+            return elsewhere
         held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, expected, fit.seen))
         there, _ = self.map.polish(scan, held, usual_slope)
         if there.seen is None:
@@ -209,6 +215,19 @@ class Odometry:
         if there.rms > WORSE * max(fit.rms, FINEST):
             return replace(fit, seen=fit.seen.as_observed())
         return replace(there, T_map_scan=self.motion.combined(there.T_map_scan, expected, there.seen))
+
+    def _observed_elsewhere(self, scan: PreparedScan, fit: Fit, expected: Expected, slope: float) -> Fit | None:
+        """A pose found from further off that fits about as well and leaves nothing open.
+
+        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing.
+        """
+        other = self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)
+        if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
+            return None
+        if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
+            return None
+        other, _ = self.map.polish(scan, other, slope)
+        return other if other.seen is not None and other.seen.observed.all() else None
 
     def _accept(self, index: int, scan: PreparedScan, expected: Expected, fit: Fit) -> None:
         """Take the fit as the pose, and the scan into the map where it has moved on or the map has grown stale."""
@@ -225,9 +244,7 @@ class Odometry:
             self.map.insert(index, scan, fit.T_map_scan)
             self.best_total = np.inf
 
-    def _bridge(
-        self, index: int, scan: PreparedScan | None, expected: Expected, fit: Fit, feature_errors: FeatureErrors
-    ) -> Frame:
+    def _bridge(self, index: int, scan: PreparedScan | None, expected: Expected, fit: Fit) -> Frame:
         """Go on at the prediction; where that lasts, with a new map, or elsewhere in the known one."""
         self.aligned, self.uncertain = 0, self.uncertain + 1
         assert self.motion
@@ -238,7 +255,7 @@ class Odometry:
             if self.uncertain >= LOST_AFTER:
                 self._begin_again(index, scan)
         T_first_scan = self.frame.pose_to_file(self.motion.T_map_scan)
-        return Frame(T_first_scan, "uncertain", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+        return Frame(T_first_scan, "uncertain", fit.overlap, fit.rms * self.frame.voxel, fit.start)
 
     def _begin_again(self, index: int, scan: PreparedScan) -> None:
         """The old map is out of sight: what follows is at least right in itself. A known map is looked for."""
@@ -253,11 +270,11 @@ class Odometry:
         self.motion.forget_place(T_map_scan)
         self.last = (index, scan, T_map_scan)
 
-    def _frame(self, scan: PreparedScan, fit: Fit, feature_errors: FeatureErrors) -> Frame:
+    def _frame(self, fit: Fit) -> Frame:
         """What came of a scan that fits."""
         assert self.motion
         T_first_scan = self.frame.pose_to_file(fit.T_map_scan)
-        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start)
         if fit.seen is None or fit.seen.observed.all():
             return found
         rotation, shift = self.motion.sigma(fit.seen.centre)

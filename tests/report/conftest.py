@@ -33,7 +33,7 @@ def doubtful(pair):
     open_way = "shift along (1.00, 0.00, 0.00)"
     return source, target, replace(
         found, status="uncertain", confidence=0.4, alternatives=others, undetermined=[open_way],
-        reasons=[f"the scans do not determine: {open_way}", "fits about as well shifted by 0.5 along (1.00, 0.00, 0.00)"],
+        reasons=[f"the scans do not determine: {open_way}", "fits about as well shifted by 0.5 along (1.0, 0.0, 0.0)"],
     )  # fmt: skip
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import MOST, Tags, data_of, numbers
 
 from fmr_cli import PointCloud
 from fmr_cli.cloud import transform_points
@@ -22,28 +20,6 @@ from fmr_cli.report.points import SHOWN
 
 pytest.importorskip("jinja2")
 pytest.importorskip("plotly")
-
-MOST = 10_000_000  # bytes
-
-
-class Tags(HTMLParser):
-    """The tags of a page with their attributes."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-
-
-def data_of(text: str):
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1])
-
-
-def numbers(text: str, kind: str) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(text), kind)
 
 
 @pytest.fixture(scope="module")
@@ -123,10 +99,10 @@ def test_plane_errors_are_the_offset_between_two_planes():
     assert target.spacing == 1
     assert target.noise == 0
     inner = grid[(np.abs(grid[:, :2] - 30) < 20).all(1)]
-    at = target.residuals(inner + [0.3, 0.4, 0.25], 3.0)
+    at = target.residuals(inner + np.array([0.3, 0.4, 0.25]), 3.0)
     np.testing.assert_allclose(at.plane, 0.25, atol=1e-9)
     np.testing.assert_allclose(at.point, np.sqrt(0.25 + 0.0625), atol=1e-9)
-    far = target.residuals(inner[:3] + [0, 0, 9.0], 3.0)
+    far = target.residuals(inner[:3] + np.array([0, 0, 9.0]), 3.0)
     assert np.isinf(far.point).all()
     assert np.isinf(far.plane).all()
 
