@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import read_poses
-from fmr_cli.io.files import atomic_write, check_readable
+from fmr_cli.io.files import check_readable
 from fmr_cli.io.transforms import as_transform, number_rows
 
 KITTI_LENGTHS = tuple(range(100, 801, 100))  # m, of the segments; from KITTI's odometry devkit, as is the next
@@ -174,21 +174,3 @@ def summary(errors: dict[str, Any]) -> list[str]:
         f"{errors['rpe_rotation_deg_rmse']:.4g} deg a frame, end drift {errors['end_drift_percent']:.3f} %"
     )
     return lines
-
-
-def plot(path: Path, poses: np.ndarray, truth: np.ndarray) -> None:
-    """Both paths from above (the two axes along which the truth extends most), as .png, .pdf or .svg."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    paths = [(np.linalg.inv(p[0]) @ p)[:, :3, 3] for p in (truth, poses)]
-    a, b = sorted(np.argsort(np.ptp(paths[0], axis=0))[-2:])
-    figure = Figure(figsize=(6, 6), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    for positions, style, label in zip(paths, ("k--", "C0-"), ("truth", "fmr"), strict=True):
-        axes.plot(positions[:, a], positions[:, b], style, label=label)
-    axes.set(aspect="equal", xlabel="xyz"[a], ylabel="xyz"[b])
-    axes.legend()
-    with atomic_write(path) as part:
-        figure.savefig(part)

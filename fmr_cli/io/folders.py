@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fmr_cli.errors import FmrError
-from fmr_cli.io import SUFFIXES
+from fmr_cli.io import SUFFIXES, holds_scans, scan_paths
 
 # A decimal number, but no part of 1.2.3; or a whole one. Only ASCII: other digits (circled, superscript) are letters.
 NUMBER = re.compile(r"(?<![0-9.])([0-9]+\.[0-9]+)(?!\.?[0-9])|([0-9]+)")
@@ -24,10 +24,14 @@ TABLES = (".txt", ".csv", ".npy", ".npz")  # also poses, calibrations, time stam
 def find_scans(paths: Iterable[Path]) -> list[Path]:
     """The readable files among the paths, folders searched recursively, sorted. Raises FmrError where there are none.
 
+    A file that is given and holds several scans (a bag, an E57, a PTX) is all of them: FILE#1, FILE#2 and so on.
     Tables (.txt, .csv, .npy, .npz) in a folder count as scans only if it holds nothing that surely is one.
     """
     paths, found = list(paths), []
     for path in paths:
+        if holds_scans(path):
+            found += scan_paths(path)
+            continue
         if not path.is_dir():
             found.append(path)
             continue

@@ -17,6 +17,7 @@ import numpy as np
 
 from fmr_cli.multiway import looks
 from fmr_cli.multiway.pose_graph import adjoint, bounded, prior_factor, symmetric
+from fmr_cli.registration.models import local_encoder
 from fmr_cli.sequence.local_map import COARSE, FINE, LocalMap, displacement
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
@@ -107,7 +108,7 @@ def lookalikes(path: np.ndarray, keys: list[int], load: Callable[[int], Prepared
         return []
     from fmr_cli.geometry.motion import Motion
 
-    described = [looks.describe(load(key).for_align, EDGE) for key in keys]
+    described = [looks.describe(load(key).for_align, EDGE, local_encoder()) for key in keys]
     alike = looks.similarity(described)
     found = []
     for later in range(1, len(keys)):

@@ -95,11 +95,11 @@ def align_sequence(
             if on_row:
                 on_row(rows[-1], len(rows), len(scans))
 
-        path, loops = np.stack(poses), 0
+        path, loops = np.stack(poses), tuple[tuple[int, int], ...]()
         if options.loop_closure:
             path, loops = close(path, rows, beginning.frame, loader)
         before = files.written(np.stack(poses)) if options.loop_closure else None
-        result = SequenceResult(files.written(path), rows, beginning.frame.voxel, before, loops, out)
+        result = SequenceResult(files.written(path), rows, beginning.frame.voxel, before, len(loops), out, loops)
         files.finish(result, path, loader)
     return result
 
@@ -209,8 +209,10 @@ def six_digits(value: float | np.floating) -> float:
 
 def close(
     T_first_scan: np.ndarray, rows: list[dict[str, Any]], frame: VoxelFrame, loader: Loader
-) -> tuple[np.ndarray, int]:
-    """The path (n, 4, 4) with its loops closed, and how many there were."""
+) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
+    """The path (n, 4, 4) with its loops closed, and the frames that each of them joins."""
     sure = np.array([row["status"] == "aligned" for row in rows])
     closed, loops = close_loops(np.stack([frame.pose_to_voxels(T) for T in T_first_scan]), sure, loader.scan)
-    return np.stack([frame.pose_to_file(T_map_scan) for T_map_scan in closed]), len(loops)
+    return np.stack([frame.pose_to_file(T_map_scan) for T_map_scan in closed]), tuple(
+        (loop.earlier, loop.later) for loop in loops
+    )

@@ -11,7 +11,7 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
-from fmr_cli.io import SUFFIXES, read_cloud
+from fmr_cli.io import SUFFIXES, holds_scans, read_cloud, scan_paths, scans_of
 from fmr_cli.io.files import check_readable
 from fmr_cli.io.folders import natural, stem, times_by_name
 from fmr_cli.io.transforms import as_transform, number_rows
@@ -89,14 +89,18 @@ def as_scans(scans: Scans | str | Path | Iterable[str | Path | PointCloud]) -> S
 def find_scans(
     path: Path, start: int = 0, stop: int | None = None, step: int = 1, outputs: Iterable[Path] = ()
 ) -> Scans:
-    """The scans of a folder, of a KITTI odometry sequence, of a KITTI raw drive, or of a text file that lists them.
+    """The scans of a folder, of a KITTI odometry sequence, of a KITTI raw drive, of a bag (or another file that holds
+    several), or of a text file that lists them.
 
     start, stop, step: as in a slice, counted over all scans. outputs: files that are no scans, wherever they lie.
     Raises CloudFileError where there are fewer than two.
     """
     notes: list[str] = []
     home = path
-    if path.is_dir():
+    in_file = holds_scans(path)
+    if in_file:
+        files = scan_paths(path)
+    elif path.is_dir():
         folder = next((f for f in (path / "velodyne", path / "velodyne_points" / "data") if f.is_dir()), path)
         home = path.parent if folder is path and path.name == "velodyne" else path
         files = in_folder(folder, {p.resolve() for p in outputs}, notes)
@@ -104,14 +108,14 @@ def find_scans(
         files = in_list(path)
     else:
         check_readable(path)
-        raise CloudFileError(f"{path}: is one file, give a folder of scans, or a .txt that lists them")
+        raise CloudFileError(f"{path}: is one file, give a folder of scans, a bag, or a .txt that lists them")
     chosen = range(len(files))[start:stop:step]
     if len(chosen) < 2:
         what = f"{len(files)} scans, {len(chosen)} of them chosen" if len(chosen) < len(files) else "one scan only"
         raise CloudFileError(f"{path}: {what}, a sequence has two or more (formats: {' '.join(SUFFIXES)})")
-    times = read_times(home, len(files)) if path.is_dir() else None
+    times = read_times(home, len(files)) if path.is_dir() and not in_file else None
     if times is None:
-        times = times_by_name([stem(file) for file in files])
+        times = times_by_name([part.name for part in scans_of(path)] if in_file else [stem(file) for file in files])
     times = None if times is None else in_order(times[np.array(chosen)], [files[i] for i in chosen], notes)
     return Scans([files[i] for i in chosen], chosen, len(files), times, read_calibration(home), notes, files)
 
