@@ -168,11 +168,13 @@ class Odometry:
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
         best = min(best, by_features, key=lambda fit: fit.total)
-        if not self._fits(best) and found.status == "aligned":
-            same = displacement(by_features.T_map_scan, T_map_features, scan.points) < FINE
-            best = by_features if same else replace(by_features, T_map_scan=T_map_features)
-            best = replace(best, verified=True)
-        return best
+        if found.status != "aligned":
+            return best
+        if not self._fits(best):
+            best = by_features
+        if displacement(best.T_map_scan, T_map_features, scan.points) > FINE:
+            return best if self._fits(best) else replace(by_features, T_map_scan=T_map_features, verified=True)
+        return replace(best, verified=True)
 
     def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
@@ -204,9 +206,12 @@ class Odometry:
         """
         assert self.motion
         usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
-        fit, slope = self.map.polish(scan, fit, usual_slope)
+        found, (fit, slope) = fit, self.map.polish(scan, fit, usual_slope)
         if np.isfinite(slope):
             self.slopes.append(slope)
+        if fit.verified:  # by the scan before, whatever little the map has there
+            same = fit.seen is not None and displacement(fit.T_map_scan, found.T_map_scan, scan.points) < FINE
+            return replace(fit, seen=fit.seen.as_observed()) if fit.seen and same else replace(found, rms=fit.rms)
         if fit.seen is None or fit.seen.observed.all():
             return fit
         elsewhere = self._observed_elsewhere(scan, fit, expected, usual_slope)
