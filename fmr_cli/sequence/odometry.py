@@ -37,6 +37,7 @@ MIN_OVERLAP, MAX_COST = 0.35, 3.0
 OVERLAP_DROP = 0.5  # of the running median of overlaps, at least
 DOUBTFUL_OVERLAP, DOUBTFUL_TOTAL = 0.85, 1.25  # against the running medians: beyond, more starts are tried
 CONVINCING = 2.3  # a ``total`` for which one start is enough; right poses have up to 2.1, wrong ones from 2.9
+FALLEN = 0.7  # of the usual overlap: below it the registration onto the scan before is asked, whatever the starts say
 STRIKING = 1.5  # times the usual ``total``: beyond it one start is not enough
 TRUSTED_AFTER = 2  # aligned frames in a row, after which the prediction alone may do
 EXPECTED_ERROR = 3  # times the largest of the last prediction errors: so far may the next one be off
@@ -163,7 +164,7 @@ class Odometry:
         fits += [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
         best = min(fits, key=lambda fit: fit.total)
         same = all(displacement(fit.T_map_scan, best.T_map_scan, scan.points) < FINE / 2 for fit in fits)
-        if self._fits(best) and ((len(fits) > 1 and same) or self._convincing(best)):
+        if self._fits(best) and not self._fallen(best) and ((len(fits) > 1 and same) or self._convincing(best)):
             return best
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
@@ -187,6 +188,10 @@ class Odometry:
     def _fits(self, fit: Fit) -> bool:
         usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
         return fit.verified or (fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST)
+
+    def _fallen(self, fit: Fit) -> bool:
+        """Whether so little of the scan has a counterpart that starts which agree may all be wrong."""
+        return bool(self.usual) and fit.overlap < FALLEN * float(np.median([overlap for overlap, _ in self.usual]))
 
     def _convincing(self, fit: Fit) -> bool:
         """Whether a pose that one start alone has found needs no other opinion."""

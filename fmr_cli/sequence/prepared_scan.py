@@ -30,7 +30,7 @@ FEW = 512  # points that a scan's global feature is made of: enough to tell pose
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
 # Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
 # no surface, and on coarser ones a scan slides.
-HINT = 1.5
+HINT = 1.25
 STEPS = 6  # of the search for the voxel, at most; each brings the count within a few percent
 COUNT_TOLERANCE = 0.1  # share by which the count may miss WORKING_POINTS
 # The count goes with the edge to the power of -1.5 to -2 (the rings of a LiDAR, a surface): -1 / 0.6 lies in between.
