@@ -18,7 +18,7 @@ import numpy as np
 from fmr_cli.errors import RegistrationError
 from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
-from fmr_cli.sequence.local_map import COARSE, FINE, REACH, WIDE, Fit, LocalMap, displacement
+from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
@@ -151,9 +151,10 @@ class Odometry:
         Where none fits the map, the registration onto the scan before counts, if its verdict is "aligned".
         """
         T_map_predicted, expected = next_frame.T_map_scan, EXPECTED_ERROR * max(self.errors, default=np.inf)
-        fits = []
+        # The widest level reaches far, and slides along a street: it only ever competes with the narrower ones.
+        fits = [] if expected < FINE else [self.map.fit(scan, T_map_predicted, (COARSE, FINE), "prediction")]
         if self.aligned > TRUSTED_AFTER:
-            fit = self.map.fit(scan, T_map_predicted, levels(expected), "prediction")
+            fit = fits[0] if fits else self.map.fit(scan, T_map_predicted, (FINE,), "prediction")
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
                 return fit
             fits = [fit]
@@ -335,10 +336,3 @@ class Odometry:
         for index in state["map"]:
             self.map.insert(index, load(index), T_map_scan[index])
         self.last = (state["last"], load(state["last"]), T_map_scan[state["last"]])
-
-
-def levels(expected: float) -> tuple[float, ...]:
-    """The map's levels from which a pose is reached that the prediction misses by so many voxels, coarse to fine."""
-    if expected < FINE:
-        return (FINE,)
-    return (COARSE, FINE) if expected < COARSE * REACH else (WIDE, COARSE, FINE)
