@@ -70,7 +70,8 @@ def plot(trainer: Trainer) -> str:
     for name in shares:
         axes[1].plot(steps, [float(row[name]) for row in table], ".-", label=name.split(":")[0])
     axes[0].set(xlabel="step", title="losses", yscale="log")
-    axes[1].set(xlabel="step", title=trainer.task.measure, ylim=(0, 1))
+    axes[1].set(xlabel="step", title=trainer.task.measure)
+    axes[1].set_ylim(bottom=0)
     if check:
         width, place = 0.2, range(len(check))
         for k, (what, when) in enumerate((w, t) for w in ("right", "aligned") for t in ("before", "after")):
