@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fmr_cli.cli.console import err, progress, say, warn
+from fmr_cli.cli.options import Report, Topic, check_report
 from fmr_cli.errors import FmrError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 def train_command(
     scans: Annotated[
-        list[Path] | None, typer.Argument(help="Scans, meshes, or folders of them.", show_default=False)
+        list[Path] | None, typer.Argument(help="Scans, meshes, bags, or folders of scans.", show_default=False)
     ] = None,
     unsupervised: Annotated[bool, typer.Option("--unsupervised", help="From the scans alone; no label.")] = False,
     semi_supervised: Annotated[
@@ -50,6 +51,8 @@ def train_command(
     overlap: Annotated[float | None, typer.Option(help="Least overlap.", show_default="0.6", min=0.1, max=1.0)] = None,
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same weights (CPU).", min=0)] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to train.")] = "auto",
+    report: Report = None,
+    topic: Topic = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
 ) -> None:
     """Learn from SCANS what registration uses, starting from the bundled model; see what it gained.
@@ -61,7 +64,11 @@ def train_command(
     it was made from, held-out figures), training.png, recipe.toml, metrics.csv, registered.json (the poses found) and
     state.safetensors (for --resume).
     """
+    from fmr_cli.io.parts import with_topic
     from fmr_cli.training.run import prepare, settings
+
+    check_report(report)
+    scans = [with_topic(path, topic) for path in scans or []] or None
 
     if resume and (unsupervised or semi_supervised or recipe or start or learning_rate is not None or seed is not None):
         raise FmrError("--resume goes on with the settings saved in --out; leave the other settings away")
@@ -87,6 +94,10 @@ def train_command(
             task, description=what, completed=done, total=total, said=""
         )
         stopped = learn(trainer, partial(bar.update, task), quiet)
+    if report and trainer.rank == 0 and trainer.progress.scores:
+        from fmr_cli.report.training_page import write_training
+
+        write_training(report, trainer, stopped)
     if not quiet:
         conclude(trainer, stopped)
 

@@ -8,14 +8,13 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fmr_cli.evaluation.verdict_evidence import Judged
-from fmr_cli.registration.confidence import Weights, confidences, products, sigmoid, standing
+from fmr_cli.registration.confidence import QUALITY, Weights, confidences, products, sigmoid, standing
 
 RIDGE = 2e-3  # on the standardised weights of support and fit: next to nothing where the evidence decides
 PRODUCT_RIDGE = 3.0  # on those of the verdict, of as many observations: of 3, 10 and 30 the best on other pairs
 TINY = 1e-9  # a probability below it is a rounding error
 STARTS = (0.3, 1.0)  # all weights, where the fit begins
 FOLDS = 5
-QUALITY = slice(2, 5)  # of ``Evidence.vector``: what ``Evidence.quality`` gives
 
 
 def fit(evidence: Sequence[Judged]) -> Weights:
@@ -25,26 +24,26 @@ def fit(evidence: Sequence[Judged]) -> Weights:
     may count against its own sense: what one happens to say about another in these scans need not hold elsewhere.
     """
     support, quality = fit_support(evidence)
-    eleven = np.ones(11)
-    first = Weights(support, quality, 0 * eleven, eleven, np.zeros(78))
-    standings = [standing(j.x, first) for j in evidence]
+    none = np.zeros(0)
+    standings = [standing(j.x, Weights(support, quality, none, none, none)) for j in evidence]
     x = np.array([s for _, s in standings])
     best = [int(weigh.argmax()) for weigh, _ in standings]
     right = np.array([j.right[i] for j, i in zip(evidence, best, strict=True)])
-    known = Weights(support, quality, x.mean(0), x.std(0) + 1e-6, np.zeros(78))
+    known = Weights(support, quality, x.mean(0), x.std(0) + 1e-6, none)
     return Weights(support, quality, known.mean, known.std, logistic(products(x, known), right))
 
 
 def fit_support(evidence: Sequence[Judged]) -> tuple[np.ndarray, np.ndarray]:
-    """(9,) and (3,): support s and fit f, under which pose i is right with s_i times its share of all s_j exp(f_j)."""
+    """(d,) and (q,): support s and fit f, under which pose i is right with s_i times its share of all s_j exp(f_j)."""
     x = np.concatenate([j.x for j in evidence])
     right = np.concatenate([j.right for j in evidence])
     pair = np.repeat(np.arange(len(evidence)), [len(j.x) for j in evidence])
     spread, none = np.append(1.0, x[:, 1:].std(0) + TINY), np.bincount(pair, right) == 0
+    kinds = x.shape[1]
 
     def loss(w: np.ndarray) -> float:
-        s = sigmoid(x @ (w[:9] / spread))
-        f = x[:, QUALITY] @ (w[9:] / spread[QUALITY])
+        s = sigmoid(x @ (w[:kinds] / spread))
+        f = x[:, QUALITY] @ (w[kinds:] / spread[QUALITY])
         highest = np.full(len(evidence), -np.inf)
         np.maximum.at(highest, pair, f)
         weigh = s * np.exp(np.clip(f - highest[pair], -50, 0))
@@ -52,10 +51,11 @@ def fit_support(evidence: Sequence[Judged]) -> tuple[np.ndarray, np.ndarray]:
         each, hit = np.bincount(pair, p), np.bincount(pair, p * right)
         return float(-np.log(np.maximum(np.where(none, 1 - each, hit), TINY)).mean() + RIDGE * (w[1:] ** 2).mean())
 
-    bounds = [(None, None)] + [(0, None)] * 11
-    found = [minimize(loss, np.append(0.0, np.full(11, s)), method="L-BFGS-B", bounds=bounds) for s in STARTS]
+    free = kinds - 1 + QUALITY.stop - QUALITY.start
+    bounds = [(None, None)] + [(0, None)] * free
+    found = [minimize(loss, np.append(0.0, np.full(free, s)), method="L-BFGS-B", bounds=bounds) for s in STARTS]
     best = min(found, key=lambda m: m.fun).x
-    return best[:9] / spread, best[9:] / spread[QUALITY]
+    return best[:kinds] / spread, best[kinds:] / spread[QUALITY]
 
 
 def logistic(x: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from fmr_cli.geometry.se3 import exp
 
 ITERATIONS = 30  # at most; from a refined pose it converges in about ten
 SCALE = 3.0  # medians of |r|: the robust kernel's scale, 2 sigma of normal residuals
+FACING = 0.7  # |cosine| between the normals of partners, at least: a table and its edge are none
 STILL = 1e-9  # rad, and voxel edges: a step below it is rounding
 
 
@@ -75,15 +76,26 @@ def point_to_plane(
     T: np.ndarray,
     reach: float,
     pivot: np.ndarray,
+    facing: np.ndarray | None = None,
 ) -> Normal:
-    """Linearise n·(T x - y) over nearest neighbours within reach; the step turns (and scales) about ``pivot`` (3,)."""
+    """Linearise n·(T x - y) over nearest neighbours within reach; the step turns (and scales) about ``pivot`` (3,).
+
+    facing: the source's own normals (N, 3), where only partners that face along count.
+    """
     moved = transform_points(T, source)
     distance, match = tree.query(moved, distance_upper_bound=reach)
     here = np.isfinite(distance)
+    if facing is not None:
+        here[here] = face_along(facing[here] @ T[:3, :3].T, normals[match[here]])
     r, J = linearise(moved[here], target[match[here]], normals[match[here]], pivot, scale=True)
     s2 = (SCALE * np.median(np.abs(r))) ** 2 + 1e-24 * reach**2 if len(r) else 1.0  # copies fit to rounding
     w = geman_mcclure(r * r, s2)
     return Normal(*normal_equations(J, r, w), float((w * r * r).sum() / max(w.sum(), 1e-12)), len(r))
+
+
+def face_along(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Which normals a and b (N, 3), of undetermined sign, agree: (N,)."""
+    return np.abs(np.einsum("ni,ni->n", a, b)) > FACING
 
 
 def constrained(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,7 @@ from fmr_cli.multiway.consistency import AGREE, Component, Join
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Apart, Network, Placed
 from fmr_cli.multiway.pose_graph import Factor, Prior, Solution
-
-if TYPE_CHECKING:
-    from fmr_cli.multiway.pipeline import Survey
+from fmr_cli.multiway.survey import Survey, nearest_pairs
 
 LEAST_CONFIDENT = 0.1  # of a hypothesis that counts once the network agrees with it
 DOUBTFUL = 1.5  # voxel edges that a link may differ from what all others say, ...
@@ -102,7 +99,7 @@ def agreeing(survey: Survey, component: Component) -> list[Link]:
             continue
         expected = np.linalg.inv(poses[link.target]) @ poses[link.source]
         off = [
-            float(looks.displacement(h.T_target_source, expected, moment(survey, link.source))) for h in link.hypotheses
+            float(looks.displacement(h.T_target_source, expected, survey.moment(link.source))) for h in link.hypotheses
         ]
         best = int(np.argmin(off))
         both_held = link.source in component.held and link.target in component.held
@@ -126,16 +123,12 @@ def contradiction(survey: Survey, link: Link, T_target_source: np.ndarray | None
     """How far a link lies from where the others have it (4, 4), in edges; NaN where they don't say."""
     if T_target_source is None:
         return float("nan")
-    off = looks.displacement(T_target_source, link.T_target_source, moment(survey, link.source))
+    off = looks.displacement(T_target_source, link.T_target_source, survey.moment(link.source))
     return float(off) / link.edge
 
 
 def said(link: Link, text: str) -> str:
     return "; ".join(filter(None, [link.message, text]))
-
-
-def moment(survey: Survey, scan: int) -> np.ndarray:
-    return survey.description(scan, survey.edges[scan]).moment
 
 
 def factor_of(survey: Survey, link: Link) -> Factor:
@@ -173,18 +166,18 @@ def mean_pose(poses: list[np.ndarray]) -> np.ndarray:
 def refine(survey: Survey, component: Component, solution: Solution, anchor: int) -> joint.Refined:
     """All scans of a component at once, from the graph's poses."""
     poses, held = solution.T_component_scan, component.held or {anchor}
-    rejected = {(min(x.ends), max(x.ends)) for x in survey.links.values() if x.status == "rejected"}
+    rejected = {x.ends for x in survey.links.values() if x.status == "rejected"}
 
     def shared(i: int, j: int) -> float:
         return survey.overlap(i, j, np.linalg.inv(poses[j]) @ poses[i])
 
-    pairs = joint.partners(poses, shared, rejected)
+    pairs = joint.partners(nearest_pairs(poses, 3 * joint.PARTNERS), shared, rejected)
     numbers = sorted(poses)
     made = survey.each("refining", lambda n: joint.view(survey.store.prepared(n), survey.edges[n]), numbers)
     views = dict(zip(numbers, made, strict=True))
     priors: list[Prior] = [p for p in survey.priors() if p.scan in poses]
     motion = survey.motion(anchor, anchor)
-    return joint.refine(poses, views, pairs, held, motion, survey.pool, priors)
+    return joint.refine(poses, views, pairs, held, motion, survey.workers, priors)
 
 
 def judged(survey: Survey, link: Link) -> Link:
@@ -201,7 +194,7 @@ def judged(survey: Survey, link: Link) -> Link:
     elif link.status == "aligned":
         link = replace(link, status="rejected", message=said(link, "too much speaks against joining its components"))
     if link.status == "rejected" and link.source in consistency.telling(list(survey.links.values())):
-        share = link.hypotheses[0].seen_through
+        share = link.hypotheses[0].seen_through or 0.0
         if share > visibility.CONTRADICTED:
             link.message = said(link, f"one scan sees through {share:.1%} of the other there")
     return link

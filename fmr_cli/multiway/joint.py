@@ -7,18 +7,17 @@ taken at the common solution, weighted by its own noise, and only in the directi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from fmr_cli.geometry.motion import Motion, exp
-from fmr_cli.geometry.normals import neighbours, normals_and_variation
 from fmr_cli.geometry.observability import WEAK
 from fmr_cli.geometry.point_to_plane import point_to_plane
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.multiway.pose_graph import EXACT, Prior, adjoint
+from fmr_cli.multiway.workers import Workers
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 
 FINER = 2.0  # times the grid on which pairs are registered
@@ -67,22 +66,20 @@ class System:
 def view(scan: Prepared, edge: float) -> View:
     """The scan on voxels of ``edge`` over FINER, or as fine as its spacing allows."""
     fine = min(max(edge / FINER, SPACINGS * scan.spacing), edge)
-    points = scan.surface(fine).points
-    tree = cKDTree(points)
-    normals = normals_and_variation(points, *neighbours(points, tree))[0]
+    surface = scan.surface(fine)
+    points = surface.points
     some = sample(np.arange(len(points)), POINTS, np.random.default_rng(scan.seed))
-    return View(fine, points, normals, tree, some, float(np.sqrt((points**2).sum(1).mean())))
+    return View(fine, points, surface.normals, surface.tree, some, float(np.sqrt((points**2).sum(1).mean())))
 
 
 def partners(
-    scans: Iterable[int], overlap: Callable[[int, int], float], excluded: set[tuple[int, int]]
+    pairs: Iterable[tuple[int, int]], overlap: Callable[[int, int], float], excluded: set[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """Pairs that share enough, at most PARTNERS a scan but for those that are another's best; (lower, higher)."""
-    scans = sorted(scans)
-    shares = {(i, j): overlap(i, j) for n, i in enumerate(scans) for j in scans[n + 1 :] if (i, j) not in excluded}
+    """Of pairs that may overlap those that share enough, at most PARTNERS a scan but for another's best."""
+    shares = {(i, j): overlap(i, j) for i, j in pairs if (i, j) not in excluded}
     kept: set[tuple[int, int]] = set()
-    for i in scans:
-        mine = sorted((pair for pair in shares if i in pair and shares[pair] >= LEAST), key=lambda p: (-shares[p], p))
+    for n in sorted({n for pair in shares for n in pair}):
+        mine = sorted((pair for pair in shares if n in pair and shares[pair] >= LEAST), key=lambda p: (-shares[p], p))
         kept.update(mine[:PARTNERS])
     return sorted(kept)
 
@@ -93,7 +90,7 @@ def refine(
     pairs: list[tuple[int, int]],
     held: set[int],
     motion: Motion,
-    pool: Executor,
+    workers: Workers,
     priors: Iterable[Prior] = (),
 ) -> Refined:
     """The poses at which all pairs fit best at once. held: scans that don't move; priors: poses known beforehand."""
@@ -112,7 +109,7 @@ def refine(
             )
 
         both = [pair for i, j in pairs for pair in ((i, j), (j, i))]
-        systems = [s for s in pool.map(system, both) if s is not None]
+        systems = [s for s in workers.map(system, both) if s is not None]
         if not systems or not free:
             break
         floor = float(np.median([s.variance for s in systems])) / 9
@@ -147,7 +144,8 @@ def refine(
         if factor == REACHES[-1] and moved < STILL:
             break
     if free and systems:
-        full = max(misfit(systems, floor, views), 1.0) * (B @ np.linalg.inv(normal) @ B.T)
+        inflation = max(misfit(systems, floor, views), 1.0) * repetition(systems, views)
+        full = inflation * (B @ np.linalg.inv(normal) @ B.T)
         covariance |= {i: full[place[i], place[i]] for i in free}
     for i in poses:
         mine = [s for s in systems if i in (s.source, s.target)] if pairs else []
@@ -190,6 +188,23 @@ def misfit(systems: list[System], floor: float, views: dict[int, View]) -> float
         kept = values > 1e-9 * values[-1]
         ratios.append(float((((V[:, kept].T @ b) ** 2) / values[kept]).sum() / max(kept.sum(), 1)))
     return float(np.median(ratios))
+
+
+def repetition(systems: list[System], views: dict[int, View]) -> float:
+    """By how much the normal equations count the same noise again; it multiplies the covariance.
+
+    Each pair is taken both ways, so that every residual stands in them twice. And a point's own noise goes into its
+    residuals against all k partners that see it, which the equations take for independent. Of k + 1 scans of one
+    surface, n points each with noise s², all k (k + 1) / 2 differences alike, least squares puts one scan against
+    another with a variance of 2 s² / n, whatever k; the equations, their pairs counted twice, say 2 s² / (n (k + 1)).
+    So k + 1, with k the mean over all points.
+    """
+    seen: dict[int, float] = {}
+    for s in systems:
+        seen[s.source] = seen.get(s.source, 0.0) + s.count / len(views[s.source].some)
+    weights = np.array([s.count for s in systems], float)
+    partners = np.average([max(seen[s.source], 1.0) for s in systems], weights=weights)
+    return float(partners + 1)
 
 
 def right_twist(start: np.ndarray, pose: np.ndarray) -> np.ndarray:

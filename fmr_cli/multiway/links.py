@@ -5,18 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from fmr_cli.errors import FmrError, ModelError
-from fmr_cli.geometry.frames import enter_frames
+from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import reason
-from fmr_cli.multiway.store import Store
-from fmr_cli.registration import Options, align
+from fmr_cli.registration import Options
 
 Status = Literal["aligned", "uncertain", "failed", "rejected"]
 
@@ -25,12 +22,12 @@ Status = Literal["aligned", "uncertain", "failed", "rejected"]
 class Hypothesis:
     """A pose that may be right: T_target_source (4, 4) between the centred frames; confidence: that it is.
 
-    seen_through: the share of one scan that the other one sees through there (``visibility``), 0 where nobody looked.
+    seen_through: the share of one scan that the other one sees through there (``visibility``), None until it is known.
     """
 
     T_target_source: np.ndarray
     confidence: float
-    seen_through: float = 0.0
+    seen_through: float | None = None
 
 
 @dataclass
@@ -71,26 +68,6 @@ class Link:
         return self.hypotheses[self.chosen or 0].T_target_source
 
 
-def register(store: Store, source: int, target: int, start: str, options: Options) -> Link:
-    """One pair through ``align``; whatever it runs into becomes a failed link. Raises ModelError alone."""
-    try:
-        a, b = store.prepared(source), store.prepared(target)
-        found = align(a, b, options, threads=1)
-        poses = [(found.T_target_source, found.confidence)]
-        poses += [(np.array(x["T_target_source"]), x["confidence"]) for x in found.alternatives]
-        hypotheses = [Hypothesis(enter_frames(T, a.frame, b.frame), float(c)) for T, c in poses]
-        return Link(
-            source, target, found.status, start, hypotheses,
-            found.information, found.overlap, found.inlier_rmse, found.voxel_size, "; ".join(found.undetermined),
-        )  # fmt: skip
-    except ModelError:
-        raise
-    except FmrError as error:
-        return Link(source, target, "failed", start, message=" ".join(str(error).split()))
-    except Exception as error:  # whatever one pair runs into, the others go on
-        return Link(source, target, "failed", start, message=f"{type(error).__name__}: {reason(error)}")
-
-
 def best_of(first: Link | None, second: Link) -> Link:
     """One link of two attempts at a pair: the more confident, with the poses that only the other one has."""
     if first is None:
@@ -116,7 +93,6 @@ class Journal:
     def __init__(self, path: Path | None, settings: dict[str, Any]) -> None:
         self.path, self.settings = path, settings
         self.known: dict[str, dict[str, Any]] = {}
-        self.lock = threading.Lock()
 
     def read(self) -> dict[str, Any] | None:
         """Reads what is there, without a last line that a kill has torn; returns its settings, or None."""
@@ -134,9 +110,8 @@ class Journal:
         return json.loads(lines[0])
 
     def begin(self) -> None:
-        """Writes the settings as the first line of a new journal."""
-        if self.path is not None:
-            self.path.write_text(json.dumps(self.settings) + "\n", "utf-8")
+        """Writes the settings as the first line of a new journal. Raises CloudFileError."""
+        self.append(self.settings)
 
     def recall(self, key: str) -> Link | None:
         entry = self.known.get(key)
@@ -145,18 +120,26 @@ class Journal:
         poses = [Hypothesis(np.array(T), c) for T, c in entry["hypotheses"]]
         return Link(**{**entry, "hypotheses": poses, "information": np.array(entry["information"])})
 
-    def keep(self, key: str, link: Link) -> None:
-        """Puts an attempt on disk."""
-        if self.path is None:
-            return
+    def keep(self, key: str, link: Link) -> Link:
+        """Puts an attempt on disk, and returns it. Raises CloudFileError."""
         names = ("source", "target", "status", "start", "overlap", "inlier_rmse", "edge", "message")
         entry = {name: getattr(link, name) for name in names}
         entry |= {"hypotheses": [(h.T_target_source.tolist(), h.confidence) for h in link.hypotheses]}
-        entry |= {"key": key, "information": link.information.tolist()}
-        with self.lock, self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        self.append({"key": key, **entry, "information": link.information.tolist()})
+        return link
+
+    def append(self, entry: dict[str, Any]) -> None:
+        if self.path is None:
+            return
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise CloudFileError(
+                f"{self.path}: cannot be written ({reason(error)}); make room, then go on with --resume"
+            ) from None
 
 
 def key_of(source: int, target: int, start: str, options: Options) -> str:

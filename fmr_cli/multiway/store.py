@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -27,7 +28,7 @@ class Store:
     edges: the voxel edge of each scan's grid, shared by scans of like size so that each is described once (``looks``).
     """
 
-    def __init__(self, scans: list[Scan], seed: int, spill: Path | None) -> None:
+    def __init__(self, scans: Sequence[Scan] | dict[int, Scan], seed: int, spill: Path | None) -> None:
         self.scans, self.seed, self.spill = scans, seed, spill
         self.edges: dict[int, float] = {}
         self.kept: OrderedDict[int, Future[Prepared]] = OrderedDict()
@@ -69,6 +70,13 @@ class Store:
         if self.spill is None or isinstance(self.scans[number].source, PointCloud):
             return None
         return self.spill / f"{self.scans[number].name}.npy"
+
+    def clear(self) -> None:
+        """Removes what was spilled."""
+        if self.spill and self.spill.is_dir():
+            for file in self.spill.iterdir():
+                file.unlink()
+            self.spill.rmdir()
 
     def let_go(self) -> None:
         """Lets go of the least recently used while more than CACHED_POINTS are kept."""

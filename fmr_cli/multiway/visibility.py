@@ -4,17 +4,20 @@ Two offices with the same walls fit each other nearly everywhere; what differs i
 the floor behind it. A scan taken from one place sees along straight lines, and up to its points everything is free. The
 place is seldom known (scans are moved, formats drop it), but it shows: from there, and from nowhere else, no point of
 the scan hides another.
+
+A surface that is seen edge-on says nothing, neither of the viewpoint nor of the other scan: within one cell of a range
+image it reaches from near to far, and a scanner that stands in a doorway sees the wall beside it and what is behind by
+the same ray, but for a centimetre.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fmr_cli.geometry.sampling import sample
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 
 FINER = 2.0  # times the grid on which pairs are registered
@@ -24,13 +27,18 @@ SLANT = 0.08  # more, and from far off, where all lies at about one range, nothi
 APART = 3.0  # fine edges that a scan must see beyond a point to see through it
 NEAR = 2.5  # fine edges within which a point has its counterpart
 SEEN = 3  # points of a cell, below which it says nothing
-STARTS, FEW, MANY, DESCENTS, STEPS = 300, 3_000, 12_000, 3, 50  # of the search for the viewpoint
+FACING, SQUARE = 0.3, 0.4  # |cosine| between ray and normal from which a surface counts: seen through, hidden
+STARTS, FEW = 160, 2_000  # random places that the search for the viewpoint begins with, and points they are tried on
+DESCENTS, GENERATIONS, DRAWS, ELITE, MANY = 3, 6, 18, 5, 5_000  # from the best of them, by the cross-entropy method
+AS_GOOD = (
+    0.002  # share of hidden points more than at the best place that leaves a scanner where its file has the origin
+)
 SAMPLE = 4_000  # points that are brought into the other scan's view
 
 # Shares of points that are seen through, on the building of `python -m benchmarks.multiway` with viewpoints found
-# by the scans alone: right poses 0.000 to 0.020 (median 0.0005), wrong ones 0.010 to 0.38 (median 0.05).
-CONTRADICTED = 0.01  # takes as much off a pose's log odds as the surest link has; see ``doubt``
-ONE_PLACE = 0.004  # of each scan's best link, in the median: above it, scans were not taken from one place each
+# by the scans alone: right poses 0.000 to 0.005, wrong ones that fit well by surfaces and features 0.009 to 0.04.
+CONTRADICTED = 0.008  # takes as much off a pose's log odds as the surest link has; see ``doubt``
+ONE_PLACE = 0.003  # of each scan's best link, in the median: above it, scans were not taken from one place each
 
 _columns = np.maximum((2 * ROWS * np.sin((np.arange(ROWS) + 0.5) / ROWS * np.pi)).astype(int), 1)
 _first = np.concatenate([[0], np.cumsum(_columns)])  # number of each row's first cell
@@ -38,13 +46,15 @@ _first = np.concatenate([[0], np.cumsum(_columns)])  # number of each row's firs
 
 @dataclass(frozen=True)
 class Viewed:
-    """A scan as seen from where it was taken; centred. points (M, 3), tree; some (k, 3) of them; edge: of their grid.
+    """A scan as seen from where it was taken; centred. edge: of its grid; tree: of all its points.
 
-    viewpoint (3,). nearest, count: range of the nearest point and number of points in each cell of the range image.
+    some, normals (k, 3): of a few points. viewpoint (3,). nearest, count: range of the nearest point and number of
+    points in each cell of the range image.
     """
 
     edge: float
     some: np.ndarray
+    normals: np.ndarray
     tree: cKDTree
     viewpoint: np.ndarray
     nearest: np.ndarray
@@ -54,39 +64,60 @@ class Viewed:
 def view(scan: Prepared, edge: float) -> Viewed:
     """The scan on a grid FINER than ``edge``, from the viewpoint that explains it best."""
     fine = min(max(edge / FINER, SPACINGS * scan.spacing), edge)
-    points = scan.surface(fine).points
+    surface = scan.surface(fine)
     rng = np.random.default_rng(scan.seed)
-    place = viewpoint(points, fine, scan.frame.enter(np.zeros((1, 3)))[0], rng)
+    order = rng.permutation(len(surface.points))  # samples are its beginnings
+    points, normals = surface.points[order], surface.normals[order]
+    place = viewpoint(points, normals, fine, scan.frame.enter(np.zeros((1, 3)))[0], rng)
     nearest, count = range_image(points - place)
-    return Viewed(fine, sample(points, SAMPLE, rng), cKDTree(points), place, nearest, count)
+    return Viewed(fine, points[:SAMPLE], normals[:SAMPLE], surface.tree, place, nearest, count)
 
 
-def viewpoint(points: np.ndarray, edge: float, guess: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The place (3,) within the scan's box from which the fewest of its points are hidden; ``guess`` is one start."""
+def viewpoint(
+    points: np.ndarray, normals: np.ndarray, edge: float, origin: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """The place (3,) within the scan's box from which the fewest of its points (N, 3), in random order, are hidden.
+
+    origin: that of the scan's file, where it lies in the box and is about as good as the best.
+    """
     low, high = points.min(0), points.max(0)
-    starts = np.clip(np.vstack([guess, points.mean(0), rng.uniform(low, high, (STARTS, 3))]), low, high)
-    few, many = sample(points, FEW, rng), sample(points, MANY, rng)
-    order = np.argsort([hidden(few - start, edge) for start in starts], kind="stable")
-    found = []
-    for place in starts[order[:DESCENTS]]:
-        step, least = 0.06 * (high - low), hidden(many - place, edge)
-        for _ in range(STEPS):
-            other = np.clip(place + rng.normal(size=3) * step, low, high)
-            share = hidden(many - other, edge)
-            if share < least:
-                place, least = other, share
-            else:
-                step = 0.92 * step
-        found.append((least, place))
-    return min(found, key=lambda x: x[0])[1]
+    x, n = points.astype(np.float32), normals.astype(np.float32)  # exact enough for cells of 3 degrees, and faster
+
+    def share(place: np.ndarray, count: int) -> float:
+        return hidden(x[:count] - place.astype(np.float32), n[:count], edge)
+
+    starts = np.vstack([points.mean(0), rng.uniform(low, high, (STARTS, 3))])
+    starts = starts[np.argsort([share(start, FEW) for start in starts], kind="stable")[:DESCENTS]]
+    found = [descend(lambda place: share(place, MANY), start, low, high, rng) for start in starts]
+    least, best = min(found, key=lambda item: item[0])
+    if np.all((low <= origin) & (origin <= high)) and share(origin, MANY) <= least + AS_GOOD:
+        return origin
+    return best
 
 
-def hidden(rays: np.ndarray, edge: float) -> float:
-    """The share of points (N, 3), about a viewpoint, that another one of their cell hides."""
+def descend(
+    share: Callable[[np.ndarray], float], start: np.ndarray, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
+) -> tuple[float, np.ndarray]:
+    """The least share and its place, about a start: draws from a normal distribution that follows the best of them."""
+    mean, std, best = start, 0.06 * (high - low), (share(start), start)
+    for _ in range(GENERATIONS):
+        places = np.clip(mean + rng.normal(size=(DRAWS, 3)) * std, low, high)
+        shares = np.array([share(place) for place in places])
+        elite = np.argsort(shares, kind="stable")[:ELITE]
+        if shares[elite[0]] < best[0]:
+            best = float(shares[elite[0]]), places[elite[0]]
+        mean, std = places[elite].mean(0), 0.5 * places[elite].std(0) + 0.25 * std
+    return best
+
+
+def hidden(rays: np.ndarray, normals: np.ndarray, edge: float) -> float:
+    """The share of points (N, 3), about a viewpoint and SQUARE to it, that another one of their cell hides."""
     cell, distance = cells(rays)
-    nearest = np.full(_first[-1], np.inf)
+    nearest = np.full(_first[-1], np.inf, distance.dtype)
     np.minimum.at(nearest, cell, distance)
-    return float((distance * (1 - SLANT) > nearest[cell] + BEHIND * edge).mean())
+    square = np.abs(np.einsum("ni,ni->n", rays, normals)) > SQUARE * distance
+    behind = distance * (1 - SLANT) > nearest[cell] + BEHIND * edge
+    return float((behind & square).sum() / max(square.sum(), 1))
 
 
 def range_image(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,26 +131,29 @@ def range_image(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def cells(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The cell of about 3 by 3 degrees that each of the rays (N, 3) lies in, and their lengths."""
     distance = np.sqrt((rays * rays).sum(1))
-    polar = np.arccos(np.clip(rays[:, 2] / np.maximum(distance, 1e-300), -1, 1))
+    polar = np.arccos(np.clip(rays[:, 2] / np.maximum(distance, 1e-30), -1, 1))
     row = np.minimum((polar * (ROWS / np.pi)).astype(int), ROWS - 1)
     turn = (np.arctan2(rays[:, 1], rays[:, 0]) + np.pi) / (2 * np.pi)
     return _first[row] + np.minimum((turn * _columns[row]).astype(int), _columns[row] - 1), distance
 
 
-def contradiction(source: Viewed, target: Viewed, T_target_source: np.ndarray) -> float:
-    """The larger share of one scan's points that the other sees through, of those it says anything about."""
-    return max(
-        seen_through(source, target, T_target_source), seen_through(target, source, np.linalg.inv(T_target_source))
-    )
+def contradiction(source: Viewed, target: Viewed, T_target_source: np.ndarray) -> tuple[int, int]:
+    """How many points of either scan the other one sees through at a pose, and how many it says anything about."""
+    one = seen_through(source, target, T_target_source)
+    other = seen_through(target, source, np.linalg.inv(T_target_source))
+    return one[0] + other[0], one[1] + other[1]
 
 
-def seen_through(scan: Viewed, by: Viewed, T_by_scan: np.ndarray) -> float:
+def seen_through(scan: Viewed, by: Viewed, T_by_scan: np.ndarray) -> tuple[int, int]:
+    """How many of a scan's points the other one sees through, and how many it says anything about; they face it."""
     points = scan.some @ T_by_scan[:3, :3].T + T_by_scan[:3, 3]
     edge = max(scan.edge, by.edge)
     near = np.isfinite(by.tree.query(points, distance_upper_bound=NEAR * edge)[0])
-    cell, distance = cells(points - by.viewpoint)
-    through = ~near & (by.count[cell] >= SEEN) & (by.nearest[cell] > distance + APART * edge)
-    return float(through.sum() / max((through | near).sum(), 1))
+    rays = points - by.viewpoint
+    cell, distance = cells(rays)
+    facing = np.abs(np.einsum("ni,ni->n", rays, scan.normals @ T_by_scan[:3, :3].T)) > FACING * distance
+    through = facing & ~near & (by.count[cell] >= SEEN) & (by.nearest[cell] > distance + APART * edge)
+    return int(through.sum()), int((through | (near & facing)).sum())
 
 
 def from_one_place(shares: Iterable[tuple[tuple[int, int], float]], bound: float) -> set[int]:
@@ -142,5 +176,5 @@ def from_one_place(shares: Iterable[tuple[tuple[int, int], float]], bound: float
 
 
 def doubt(share: float) -> float:
-    """What a share takes off a pose's log odds: nothing up to half of CONTRADICTED, 12 at it, 24 at twice of it."""
-    return 0.0 if share < CONTRADICTED / 2 else 12.0 * share / CONTRADICTED
+    """What a share takes off a pose's log odds: 12 at CONTRADICTED, which no single link outweighs, by its square."""
+    return 12.0 * (share / CONTRADICTED) ** 2

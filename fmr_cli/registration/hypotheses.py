@@ -71,10 +71,10 @@ def from_pose(pair: Pair, T_target_source: np.ndarray, start: str) -> list[Hypot
     return [Hypothesis(T, start, pair.overlap_score(T))]
 
 
-def from_solver(pair: Pair, T_target_source: np.ndarray, start: str) -> list[Hypothesis]:
-    """Where the paper's IC solver goes from the allowed pose next to the given one."""
+def from_solver(pair: Pair, T_target_source: np.ndarray, start: str, iterations: int | None = None) -> list[Hypothesis]:
+    """Where the paper's IC solver goes from the allowed pose next to the given one; ``iterations`` of the options'."""
     g = pair.enter_box(pair.motion.exact(T_target_source))[None]
-    iterations, robust = pair.options.iterations, pair.options.robust
+    iterations, robust = iterations or pair.options.iterations, pair.options.robust
     found = pair.solver.solve(pair.template, pair.sampled[0], g, iterations, robust, pair.motion.basis())
     T = pair.leave_box(found.g[0])
     return [Hypothesis(T, start, pair.overlap_score(T), found.errors[:, 0].tolist())]
@@ -116,10 +116,10 @@ def rivals(pair: Pair, T_target_source: np.ndarray) -> tuple[list[Hypothesis], f
 
 def runners_up(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Keypoints that look like the ones behind a pose and lie elsewhere: source and target, (C, 3) each."""
-    (p, a), (q, b) = pair.described(pair.source), pair.described(pair.target)
+    p, q = pair.described(pair.source)[0], pair.described(pair.target)[0]
     moved = transform_points(T_target_source, p)
     apart = distances_between(moved, q)
-    similarity = a @ b.T
+    similarity = pair.similarity
     behind = similarity.argmax(1), similarity.argmax(0)
     tolerance = CONSENSUS_TOLERANCE * pair.edge
     rows = np.flatnonzero(apart[np.arange(len(p)), behind[0]] < tolerance)

@@ -136,6 +136,11 @@ class Pair:
         distance = np.linalg.norm(transform_points(T_target_source, x) - y, axis=1)
         return int((distance < CONSENSUS_TOLERANCE * self.edge).sum())
 
+    @cached_property
+    def similarity(self) -> np.ndarray:
+        """Cosines between the descriptors of the source's and the target's keypoints: (K, L)."""
+        return self.described(self.source)[1] @ self.described(self.target)[1].T
+
     # What surfaces say.
 
     @cached_property

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from fmr_cli.cloud import PointCloud
+from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration import hypotheses, refinement
-from fmr_cli.registration.confidence import LIKELY, Judge
+from fmr_cli.registration import hypotheses, mirror, refinement
+from fmr_cli.registration.confidence import ALIGNED, LIKELY, Judge
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
-from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.prepared import Prepared, check_systems
 from fmr_cli.registration.result import Registration, Stopwatch, describe
-from fmr_cli.registration.units import unit_hint
+from fmr_cli.registration.units import factor_of, unit_hint
 
 REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
@@ -33,6 +33,7 @@ SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no mo
 FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
 FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000))  # the looks after it, while none is sure
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
+CHECKS = 5  # iterations of the IC solver from the pose found, where asked for
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
 log = logging.getLogger(__name__)
@@ -44,21 +45,56 @@ def prepare(cloud: PointCloud, seed: int = 0) -> Prepared:
 
 
 def align(
-    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options = Options(), threads: int = 2
+    source: PointCloud | Prepared,
+    target: PointCloud | Prepared,
+    options: Options = Options(),
+    threads: int = 2,
+    check: bool = False,
 ) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
+    With ``options.allow_mirror`` the mirror image of the source is registered too, unless the source is ``aligned``; R
+    then has the determinant -1, and ``mirrored`` says so.
+
     threads: 2 for what concerns one cloud alone to be done for both side by side, 1 where pairs run side by side
-    already. The answer is the same bit for bit, whatever their number and the machine's. Raises RegistrationError
+    already. The answer is the same bit for bit, whatever their number and the machine's. check: also let the paper's IC
+    solver go on from the pose found, see ``Registration.feature_check``. Raises RegistrationError
     where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
     contradict each other.
     """
+    found = as_they_are(source, target, options, threads, check)
+    if not options.allow_mirror or found.status == "aligned":
+        return found
+    image = mirror.image(source, options.seed)
+    other = as_they_are(image, target, options, threads, check)
+    return mirror.undone(other, image.centre) if other.status == "aligned" else found
+
+
+def mirror_fits(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options) -> float | None:
+    """The confidence that the mirror image of the source fits the target, where a quick look finds it to be aligned."""
+    time = Stopwatch()
+    with one_blas_thread(), suppress(RegistrationError):
+        image = mirror.image(source, options.seed)
+        target = target if isinstance(target, Prepared) else prepare(target, options.seed)
+        for detail in (FIRST, FURTHER[0]):
+            judge = Judge(make_pair(image, target, options, 2, *detail))
+            consider(judge, features(judge.pair, time), time)
+            if judge.sure(ALIGNED):
+                return judge.best.confidence
+    return None
+
+
+def as_they_are(
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, threads: int, check: bool
+) -> Registration:
+    """``align`` without a mirror."""
     time = Stopwatch()
     with one_blas_thread():
         with time.stage("prepare"), ThreadPoolExecutor(threads) as pool:
             source, target = pool.map(
                 lambda x: x if isinstance(x, Prepared) else prepare(x, options.seed), (source, target)
             )
+        check_systems(source, target)
         verdicts = [
             (factor, look(source if factor == 1.0 else source.scaled(factor), target, given, threads, time))
             for factor, given in scales(source, target, options)
@@ -71,8 +107,15 @@ def align(
                 best = replace(best, T_target_source=refinement.exact(judge.pair, T))
         with time.stage("verdict"):
             found = describe(judge.pair, best, judge.candidates[1:], source, factor, options)
+        if check:
+            with time.stage("check"):
+                found.feature_check = feature_check(judge.pair, best.T_target_source)
     found.warnings += [*source.notes, *target.notes]
-    if found.status != "aligned" and not options.scale and (hint := unit_hint(source.points, target.points)):
+    if (
+        found.status != "aligned"
+        and not (options.scale or options.unit)
+        and (hint := unit_hint(source.points, target.points))
+    ):
         found.warnings.append(hint)
     found.seconds = time.seconds
     return found
@@ -163,6 +206,18 @@ def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
         log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
 
 
+def feature_check(pair: Pair, T_target_source: np.ndarray) -> dict[str, Any]:
+    """Whether the paper's metric agrees with a pose: what a few iterations of its solver from there do."""
+    there = hypotheses.from_solver(pair, T_target_source, "check", CHECKS)[0]
+    centre = pair.s.points.mean(0)[None]
+    shift = transform_points(there.T_target_source, centre) - transform_points(T_target_source, centre)
+    return {
+        "errors": there.errors,
+        "angle": angle_degrees(np.linalg.inv(T_target_source) @ there.T_target_source),
+        "shift": float(np.linalg.norm(shift)),
+    }
+
+
 def may_overlap_fully(pair: Pair) -> bool:
     """Whether the clouds are of one size along each of their principal axes."""
     s, t = (
@@ -174,7 +229,7 @@ def may_overlap_fully(pair: Pair) -> bool:
 def scales(source: Prepared, target: Prepared, options: Options) -> Iterator[tuple[float, Options]]:
     """What to multiply the source by, with the options for it: a given pose's own scale, or some about the clouds'."""
     if not options.scale:
-        yield 1.0, options
+        yield factor_of(options.unit) if options.unit else 1.0, options
     elif not isinstance(options.init, str):
         T = np.array(options.init, float)
         factor = float(np.cbrt(np.linalg.det(T[:3, :3])))

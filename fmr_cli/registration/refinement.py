@@ -13,7 +13,7 @@ from fmr_cli.feature_metric.inverse_compositional import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.geometry.gicp import GicpCloud, gicp
 from fmr_cli.geometry.planar import within_plane
-from fmr_cli.geometry.point_to_plane import constrained, point_to_plane, step_motion
+from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_plane, step_motion
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.se3 import exp
 from fmr_cli.geometry.smoothing import local_planes
@@ -26,12 +26,14 @@ LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coa
 FINE = LEVELS[1:]
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, IC iterations, points of a patch
 PLANE_REACHES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.7)  # voxel edges, a step each
+PLANE_POINTS, CHOSEN_ANEW = 800, 5  # of the common region, chosen anew every so many steps
+COMMON_REACH = 4.0  # voxel edges: points nearer than that to the other surface may be of the common region
 DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
 # Tried on RedKitchen scans, by hand: roughness 0.22 at 1 % noise, below 0.08 without; 30 neighbours best of 10 to 50.
 ROUGH, SMOOTHED_OVER = 0.12, 30
 SMOOTHED_REACHES = (1.0, 1.0, 0.7, 0.7, 0.5, 0.5)  # voxel edges, a step each
-GICP_REACH = 6.0  # voxel edges: source points further from the target only slow its k-d tree down, by up to 500 times
+GICP_REACH = 3.0  # voxel edges: source points further from the target slow its k-d tree down, by up to 500 times
 EXACT_TARGET = 200_000  # points of the target that the winner is refined against once more, each its own
 FINER = 4.0  # times the grid of the last step on large clouds, where they are dense enough
 COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
@@ -81,16 +83,31 @@ def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
 
 
 def by_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
-    """The pose after robust point-to-plane steps on a few voxels, from far to near: what a hypothesis is judged at."""
-    points, basis, T = pair.some[0], pair.motion.basis(), T_target_source
-    pivot = np.zeros(3)
-    for reach in PLANE_REACHES:
-        normal = point_to_plane(points, pair.t.points, pair.t.normals, pair.t.tree, T, reach * pair.edge, pivot)
+    """The pose after robust point-to-plane steps on a few voxels, from far to near: what a hypothesis is judged at.
+
+    Only points of the common region, and partners that face along, so that at small overlap what only one scan saw
+    does not pull the pose away.
+    """
+    basis, T, pivot = pair.motion.basis(), T_target_source, np.zeros(3)
+    for number, reach in enumerate(PLANE_REACHES):
+        if number % CHOSEN_ANEW == 0:
+            points, facing = common_points(pair, T)
+        reach *= pair.edge
+        normal = point_to_plane(points, pair.t.points, pair.t.normals, pair.t.tree, T, reach, pivot, facing)
         if normal.count < MIN_POINTS:
             return T
         step = constrained_step(normal.A[:6, :6] + DAMPING * np.diag(np.diag(normal.A)[:6]), -normal.b[:6], basis)
         T = exp(step) @ T
     return T
+
+
+def common_points(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A few of the source's points that come near the target at a pose, and their normals: (n, 3) each."""
+    moved = transform_points(T_target_source, pair.s.points)
+    near = np.isfinite(pair.t.tree.query(moved, distance_upper_bound=COMMON_REACH * pair.edge)[0])
+    both = np.hstack([pair.s.points[near], pair.s.normals[near]])
+    both = sample(both, PLANE_POINTS, np.random.default_rng(pair.seed))
+    return both[:, :3], both[:, 3:]
 
 
 def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
@@ -130,9 +147,12 @@ def by_smoothed(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
 
 
 def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_source: np.ndarray) -> np.ndarray:
-    """GICP of those of the source's points that are in reach of the target."""
-    moved = transform_points(T_target_source, source)
-    near = source[np.isfinite(pair.t.tree.query(moved, distance_upper_bound=GICP_REACH * pair.edge)[0])]
+    """GICP of those of the source's points that are in reach of the target and face along with it."""
+    moved, t = transform_points(T_target_source, source), pair.t
+    distance, beside = t.tree.query(moved, distance_upper_bound=GICP_REACH * pair.edge)
+    near = np.flatnonzero(np.isfinite(distance))
+    normals = pair.s.normals[pair.s.tree.query(source[near])[1]] @ T_target_source[:3, :3].T
+    near = source[near[face_along(normals, t.normals[beside[near]])]]
     if len(near) < MIN_POINTS:
         return T_target_source
     return gicp(GicpCloud(near, pair.edge, pair.threads), target, T_target_source, pair.edge)
@@ -145,8 +165,8 @@ def exact(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     scans a finer one.
     """
     source, target, T = pair.source, pair.target, T_target_source
-    if pair.motion.dof != "rigid" or len(target.points) <= GICP_TARGET:
-        return T
+    if pair.motion.dof != "rigid" or len(target.points) <= GICP_TARGET or pair.flat_planes is not None or noisy(pair):
+        return T  # what the step before did for these, GICP would undo
     if len(target.points) <= 4 * EXACT_TARGET and in_common(pair, T):
         some = sample(source.points, GICP_SOURCE, np.random.default_rng(pair.seed))
         return gicp_in_reach(pair, some, target.for_gicp(EXACT_TARGET, pair.edge, pair.threads, own=True), T)

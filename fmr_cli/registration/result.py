@@ -36,6 +36,9 @@ class Registration:
     feature_error_before, feature_error_after: mean |F(g Q) - F(P)| of the global feature as the files are, and at T.
     feature_errors: the same before each iteration of the IC solver that led to T, and after its last; empty where T
         came from local features.
+    feature_check: where asked for, "errors" as above of a few iterations from T, and by how far they move it: "angle"
+        in degrees and "shift" of the source's centre, own unit. What only one scan saw pulls at a global feature, so at
+        part overlap they do move it.
     start: which start the pose came from ("identity", "centroid", "search", "features", "given").
     angle: rotation angle of T, degrees. shift: how far T moves the source's centre, own unit.
     information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's
@@ -44,6 +47,7 @@ class Registration:
     alternatives: other poses that would be called aligned if alone, as of a symmetric shape, best first:
         T_target_source, confidence, feature_error.
     reasons: why the status is not "aligned", in words. evidence: what the verdict is made of.
+    mirrored: whether T mirrors, which only ``options.allow_mirror`` allows.
     points: points read and points used. seconds: wall time by stage, and total.
     """
 
@@ -69,6 +73,8 @@ class Registration:
     points: dict[str, int]
     options: Options
     seconds: dict[str, float] = field(default_factory=dict)
+    feature_check: dict[str, Any] = field(default_factory=dict)
+    mirrored: bool = False
     reasons: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 

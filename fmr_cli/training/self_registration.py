@@ -18,12 +18,17 @@ from threadpoolctl import threadpool_limits
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import FmrError
 from fmr_cli.geometry.frames import leave_frames
+from fmr_cli.multiway.candidates import look_at_pairs
 from fmr_cli.multiway.consistency import AGREE
 from fmr_cli.multiway.known import Known
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
-from fmr_cli.multiway.pipeline import Progress, Survey
+from fmr_cli.multiway.pipeline import at_work
+from fmr_cli.multiway.reading import prepare
+from fmr_cli.multiway.rounds import confirm, join_components, register_most_promising
 from fmr_cli.multiway.scans import Scan
+from fmr_cli.multiway.survey import Progress, Survey
+from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import Options
 from fmr_cli.registration.agreement import agreement
 from fmr_cli.registration.pair import make_pair
@@ -105,13 +110,13 @@ def register_scans(
 
     Scans that cannot be read are left out. Raises FmrError where none can be read.
     """
-    survey = Survey([scans[n] for n in numbers], Options(model=model), Known(), None, usable_cores(), show)
-    with survey.at_work(resume=False):
-        survey.prepare()
-        survey.look_at_pairs()
-        survey.register_most_promising()
-        survey.join_components()
-        survey.confirm()
+    survey = Survey([scans[n] for n in numbers], Options(model=model), Known(), None, Threads(), show)
+    with at_work(survey, resume=False):
+        prepare(survey)
+        look_at_pairs(survey)
+        register_most_promising(survey)
+        join_components(survey)
+        confirm(survey)
         candidates = overlapping(survey)
         rng = np.random.default_rng(seed)
         chosen = of_all_bands(candidates, most, rng)

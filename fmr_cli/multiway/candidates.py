@@ -1,0 +1,110 @@
+"""Which pairs of scans are worth registering: a cheap look at each of those that resemble each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from fmr_cli.multiway import looks, visibility
+from fmr_cli.multiway.looks import Look
+from fmr_cli.multiway.survey import Ends, Survey, ends_of
+
+FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
+NEIGHBOURS = 8  # that most resemble a scan as places, looked at at a time where there are more pairs than that
+PORTIONS = 4  # of so many neighbours, at most, for scans that are still apart
+PROMISING = 0.15  # a look's promise from which a pair is worth registering: pairs without overlap hardly reach it
+ROUGHLY_ONE_PLACE, ROUGHLY_CONTRADICTED = 0.006, 0.012  # as visibility.ONE_PLACE, CONTRADICTED, at a look's rough pose
+
+
+def look_at_pairs(survey: Survey) -> None:
+    """A cheap look at every pair where they are few, else at those that most resemble each other as places."""
+    numbers = sorted(survey.edges)
+    if len(numbers) * (len(numbers) - 1) <= 2 * FEW_PAIRS:
+        look_at(survey, [(j, i) for n, i in enumerate(numbers) for j in numbers[n + 1 :] if survey.possible(j, i)])
+    else:
+        with survey.stage("look"):
+            alike = looks.similarity([survey.description(n) for n in numbers])
+            orders = (-alike).argsort(axis=1, kind="stable")
+            survey.alike = {i: [numbers[k] for k in orders[row] if k != row] for row, i in enumerate(numbers)}
+        look_further(survey)
+
+
+def look_further(survey: Survey) -> bool:
+    """Looks at the next NEIGHBOURS of each scan that is not in the largest component; False if there are none left."""
+    largest = survey.components[0].T_component_scan if survey.components else {}
+    settled = largest if len(largest) > 1 else {}
+    pairs: set[Ends] = set()
+    for i in sorted(survey.alike.keys() - settled.keys()):
+        for j in survey.alike[i][:NEIGHBOURS]:
+            pair = ends_of(i, j)
+            if pair not in survey.looks and survey.possible(*pair):
+                pairs.add(pair)
+        del survey.alike[i][:NEIGHBOURS]
+    look_at(survey, sorted(pairs))
+    return bool(pairs)
+
+
+def look_at(survey: Survey, pairs: list[Ends]) -> None:
+    """Takes in the looks at some pairs."""
+    with survey.stage("look"):
+        survey.looks.update(zip(pairs, survey.each("looking", lambda p: look(survey, p), pairs), strict=True))
+    with survey.stage("see through"):
+        promising = [p for p in pairs if survey.looks[p].promise >= PROMISING]
+        survey.each("finding viewpoints", survey.viewed, sorted({n for p in promising for n in p}))
+        discount_what_is_seen_through(survey, promising)
+
+
+def look(survey: Survey, pair: Ends) -> Look:
+    """What the local features of two scans say, without poses that are not allowed."""
+    edge = max(survey.pair_edge(*pair), 1e-300)
+    a, b = (survey.description(n, edge) for n in pair)
+    found = looks.look(a, b, survey.motion(*pair, edge))
+    return looks.best_of([x for x in every(found) if survey.allowed(*pair, x.T_target_source)])
+
+
+def every(found: Look) -> list[Look]:
+    """A look's poses, each as a look of its own."""
+    return [replace(x, others=()) for x in (found, *found.others)]
+
+
+def discount_what_is_seen_through(survey: Survey, pairs: list[Ends]) -> None:
+    """Makes looks less promising where one scan sees through the other; a look's pose is rough, so not by much.
+
+    Nothing is changed where even each scan's best look is contradicted: such scans weren't taken from one place.
+    """
+
+    def shares(pair: Ends) -> list[float]:
+        promising = [x for x in every(survey.looks[pair]) if x.promise >= PROMISING]
+        return [survey.seen_through([(*pair, x.T_target_source)]) for x in promising]
+
+    seen = dict(zip(pairs, survey.each("comparing views", shares, pairs), strict=True))
+    telling = visibility.from_one_place(((p, min(found)) for p, found in seen.items()), ROUGHLY_ONE_PLACE)
+    for pair, found in seen.items():
+        if pair[0] in telling:
+            factors = (1 / (1 + (share / ROUGHLY_CONTRADICTED) ** 2) for share in found)
+            poses = zip(every(survey.looks[pair]), factors, strict=False)
+            survey.looks[pair] = looks.best_of([replace(x, promise=f * x.promise) for x, f in poses])
+
+
+def untried(survey: Survey, start: str, least: float = PROMISING) -> list[Ends]:
+    """Pairs of that promise which have not been registered from this kind of start, best first.
+
+    A look gives up the poses that have been tried, and its promise with them; of other starts a pair has one.
+    """
+    pairs = [p for p, x in survey.looks.items() if x.promise >= least]
+    pairs = [p for p in pairs if start == "look" or (*p, start) not in survey.tried]
+    return sorted((p for p in pairs if p not in survey.never), key=lambda p: (-survey.looks[p].promise, p))
+
+
+def leading_out(survey: Survey, pairs: Iterable[Ends], most: int) -> list[Ends]:
+    """Of pairs, best first, the first ``most`` of each component that join it to another one."""
+    home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
+    taken: dict[int, int] = {}
+    chosen = []
+    for p in pairs:
+        ends = {home[n] for n in p}
+        if len(ends) == 2 and any(taken.get(k, 0) < most for k in ends):
+            chosen.append(p)
+            for k in ends:
+                taken[k] = taken.get(k, 0) + 1
+    return chosen
