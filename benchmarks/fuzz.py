@@ -1,11 +1,10 @@
 """Malformed files: mutations of small valid ones of every format, read in a process that may crash.
 
-    python -m benchmarks.fuzz --count 4000            # as the tests do
+    python -m benchmarks.fuzz --count 4000
     python -m benchmarks.fuzz --minutes 60 --out found/
 
 A file is either read, or refused by a CloudFileError whose one line begins with its path. Anything else is a finding:
-another exception, a crash, more than 2 s of the processor or 500 MB, a native library's line on stderr. Findings go to
---out.
+another exception, a crash, more than 2 s of the processor or 500 MB, a line on stderr. Findings go to --out.
 """
 
 from __future__ import annotations
@@ -36,9 +35,10 @@ SECONDS, MEGABYTES = 2.0, 500  # of the processor; of memory beyond what the pro
 LARGEST = 1_000_000  # bytes of a malformed file
 TEXT = (".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".off", ".obj")
 NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 62, (1 << 64) - 1)
-CELLS = ("", "nan", "inf", "-", "1e400", "-0", "1_0", "1,5", "1.5.2", '"', "''", "0x1F", "9" * 400, "1e-400", "\0",
-         "\ufeff",
-         "x", "-1", "999999999999", "1D+3", "#", ";", "vertex", "0 0", "\u0665", "4294967296")  # fmt: skip
+CELLS = (
+    "", "nan", "inf", "-", "1e400", "-0", "1_0", "1,5", "1.5.2", '"', "''", "0x1F", "9" * 400, "1e-400", "\0", "\ufeff",
+    "x", "-1", "999999999999", "1D+3", "#", ";", "vertex", "0 0", "\u0665", "4294967296",
+)  # fmt: skip
 
 
 def mutated(example: Example, rng: random.Random) -> bytes:
@@ -182,12 +182,29 @@ def said_wrong(path: Path) -> str | None:
     return found
 
 
+class Stderr:
+    """All that the process writes to stderr, native libraries too, since the last look."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = (folder / "stderr").open("w+b")
+        self.seen = 0
+        os.dup2(self.file.fileno(), 2)
+
+    def news(self) -> str:
+        sys.stderr.flush()
+        size = os.fstat(self.file.fileno()).st_size
+        text = os.pread(self.file.fileno(), size - self.seen, self.seen).decode(errors="replace")
+        self.seen = size
+        return text
+
+
 def work(seed: int, count: int, minutes: float | None, folder: Path) -> None:
     """The process that may crash: mutations in turn; each is a file in ``folder`` while it is read."""
     corpus = examples()
     done: Counter[str] = Counter()
     end = None if minutes is None else time.monotonic() + 60 * minutes
     number = seed
+    errors = Stderr(folder)
     while (number < seed + count) if end is None else (time.monotonic() < end):
         rng = random.Random(number)
         example = corpus[number % len(corpus)]
@@ -195,7 +212,10 @@ def work(seed: int, count: int, minutes: float | None, folder: Path) -> None:
         path = folder / f"{number}-{example.name}"
         path.write_bytes(data)
         (folder / "last").write_text(path.name)
-        if (wrong := said_wrong(path)) is not None:
+        wrong = said_wrong(path)
+        if (news := errors.news()) and wrong is None:
+            wrong = f"on stderr: {news[:300]!r}"
+        if wrong is not None:
             print(json.dumps({"file": path.name, "wrong": wrong, "of": hashlib.sha1(data).hexdigest()}), flush=True)
         else:
             path.unlink()
@@ -220,8 +240,6 @@ def run(seed: int, count: int, minutes: float | None, folder: Path) -> tuple[int
         )
         rows = [json.loads(line) for line in process.stdout.splitlines()]
         findings += [row for row in rows if "wrong" in row]
-        if process.stderr.strip():
-            findings.append({"file": "", "wrong": f"on stderr: {process.stderr.strip()[:400]}"})
         if process.returncode == 0:
             return total + rows[-1]["executions"], findings
         last = (folder / "last").read_text() if (folder / "last").exists() else ""

@@ -197,7 +197,7 @@ def summary(rows: list[dict]) -> dict[str, object]:
         hits = sum(r["right"] for r in rows)
         said |= {
             "right": hits,
-            "bounds": [round(x, 2) for x in bounds(hits, len(rows))],
+            "bounds": [round(float(x), 2) for x in bounds(hits, len(rows))],
             "aligned": sum(r["aligned"] for r in rows),
             "wrong": sum(r["aligned"] and not r["right"] for r in rows),
             "seconds": round(float(np.median([r["seconds"] for r in rows])), 2),

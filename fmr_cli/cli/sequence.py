@@ -37,7 +37,7 @@ def sequence_command(
         float | None, typer.Option(help="The map's voxel edge; half the working one if not given.", min=0.0)
     ] = None,
     voxel_size: Annotated[
-        float | None, typer.Option(help="The working voxel edge; from the data if not given.", min=0.0)
+        float | None, typer.Option(help="A wish for the working voxel edge, which the scans' density bounds.", min=0.0)
     ] = None,
     init_poses: Annotated[
         Path | None,

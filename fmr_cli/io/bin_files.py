@@ -79,7 +79,8 @@ def find_columns(path: Path, size: int) -> tuple[str, ...] | None:
     two layouts do.
     """
     sample = sample_of(path, size, "<f4")
-    wholes = [] if plausible(sample) and np.isnan(sample).mean() < 0.1 else whole_numbers_among(sample, size)
+    holes = np.isnan(sample).sum() > 0.1 * len(sample)  # colours with an alpha are NaN as float32
+    wholes = whole_numbers_among(sample, size) if holes or not plausible(sample) else []
     if plausible(sample) and not wholes:
         return columns_of(sample, size, "")
     if size % NCLT.itemsize == 0 and is_nclt(path):

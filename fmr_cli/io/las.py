@@ -171,6 +171,8 @@ def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
     table = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
     if sum(count for count, _ in table) < header.point_count:
         raise CloudFileError(f"promises {header.point_count} points and holds fewer, it is truncated: copy it again")
+    if sum(size for _, size in table) > file.size:
+        raise CloudFileError("has a damaged table of compressed chunks: copy it again")
     if max(count for count, _ in table) * header.point_format.size > max(SMALL, LAZ_LIMIT * file.size):
         raise CloudFileError("promises more points than its compressed data can hold, it is damaged: copy it again")
     start = header.offset_to_point_data + 8

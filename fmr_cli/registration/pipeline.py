@@ -19,7 +19,7 @@ from threadpoolctl import ThreadpoolController
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, mirror, refinement
-from fmr_cli.registration.confidence import ALIGNED, LIKELY, Judge
+from fmr_cli.registration.confidence import LIKELY, Judge
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -71,7 +71,7 @@ def align(
 
 
 def mirror_fits(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options) -> float | None:
-    """The confidence that the mirror image of the source fits the target, where a quick look finds it to be aligned."""
+    """The confidence that the mirror image of the source fits the target, where a quick look is sure of it."""
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):
         image = mirror.image(source, options.seed)
@@ -79,7 +79,7 @@ def mirror_fits(source: PointCloud | Prepared, target: PointCloud | Prepared, op
         for detail in (FIRST, FURTHER[0]):
             judge = Judge(make_pair(image, target, options, 2, *detail))
             consider(judge, features(judge.pair, time), time)
-            if judge.sure(ALIGNED):
+            if judge.sure(SURE):
                 return judge.best.confidence
     return None
 

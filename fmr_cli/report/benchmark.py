@@ -79,6 +79,7 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]
 
 def plot(path: Path, dataset: DataSet, outcomes: Sequence[Outcome]) -> None:
     """The share of the pairs whose error is below a bound, over that bound: rotation and shift, a line a method."""
+<<<<<<< HEAD
     panels = (("rre", "rotation error, deg"), ("rte", "shift, scans' unit"))
     methods = list(dict.fromkeys(row.method for row in outcomes))
     with plots.figure(path, plots.PAGE, 2.8) as figure:
@@ -94,3 +95,21 @@ def plot(path: Path, dataset: DataSet, outcomes: Sequence[Outcome]) -> None:
                 axis.step(np.clip([low, *error], low, 10 * high), share, where="post", **style)
         axes[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
         axes[1].legend(fontsize="small", frameon=False)
+=======
+    methods = list(dict.fromkeys(row.method for row in outcomes))
+    with plots.figure(path, plots.PAGE, 2.9) as figure:
+        panels = figure.subplots(1, 2, sharey=True)
+        for panel, name, label in zip(
+            panels, ("rre", "rte"), ("rotation error, deg", "shift, scans' unit"), strict=True
+        ):
+            for number_, method in enumerate(methods):
+                error = np.sort([getattr(row, name) for row in outcomes if row.method == method])
+                style = {k: v for k, v in plots.look(number_).items() if k != "marker"}
+                panel.step(np.maximum(error, 1e-9), np.arange(1, len(error) + 1) / len(error), where="post", **style)
+            finite = [e for row in outcomes if np.isfinite(e := getattr(row, name)) and e > 0]
+            panel.set(xscale="log", xlabel=label, ylim=(-0.02, 1.02))
+            if finite:
+                panel.set_xlim(max(np.quantile(finite, 0.02) / 2, 1e-6), max(finite) * 1.1)
+        panels[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
+        plots.names_above(figure, methods, lines=True)
+>>>>>>> main

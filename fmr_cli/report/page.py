@@ -21,8 +21,9 @@ from fmr_cli.io.outputs import check_outputs
 
 NEEDED = {"jinja2": "Jinja2", "plotly": "plotly", "PIL": "pillow"}  # module -> package
 STATUS = {  # of a pair, a link, a scan, a frame: a class for the colour, and a shape for those who see none
-    "aligned": ("good", "✔"), "placed": ("good", "✔"), "known": ("good", "✔"), "uncertain": ("doubtful", "▲"),
-    "unplaced": ("doubtful", "▲"), "rejected": ("bad", "✖"), "failed": ("bad", "✖"),
+    "aligned": ("good", "✔"), "placed": ("good", "✔"), "known": ("good", "✔"), "right": ("good", "✔"),
+    "uncertain": ("doubtful", "▲"), "unplaced": ("doubtful", "▲"), "wrong": ("bad", "✖"), "rejected": ("bad", "✖"),
+    "failed": ("bad", "✖"),
 }  # fmt: skip
 
 

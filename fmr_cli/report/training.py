@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from fmr_cli.io.files import atomic_write
+from fmr_cli.report import plots
 from fmr_cli.training.loop import Report, Trainer
 from fmr_cli.training.run import check_cells, score_table
 from fmr_cli.training.run_folder import METRICS, MODEL
@@ -53,37 +53,47 @@ def check_report(trainer: Trainer) -> Table | None:
 
 def plot(trainer: Trainer) -> str:
     """``training.png``: losses, held-out figures by step, pairs before and after. Returns why there is none, or ''."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        return f"no {PLOT}: it needs matplotlib; pip install 'fmr-cli[eval]'"
+    if not plots.can_plot():
+        return f"no {PLOT}: it needs matplotlib; pip install 'fmr-cli[report]'"
     path = trainer.folder.path
     table = list(csv.DictReader((path / METRICS).open(newline="")))
     steps = [int(row["step"]) for row in table]
     check = (trainer.progress.check or {}).get("rows", [])
-    figure = Figure((13 if check else 9, 3.6), layout="constrained")
-    axes = figure.subplots(1, 3 if check else 2)
-    for name in [n for n in table[0] if n.startswith("loss_")] or [n for n in table[-1] if n.startswith("loss_")]:
-        known = [(s, float(row[name])) for s, row in zip(steps, table, strict=True) if row[name]]
-        axes[0].plot(*zip(*known, strict=True), ".-", label=name[5:])
-    shares = [n for n in table[0] if n.endswith((": right matches", ": rank-1", ": success"))]
-    for name in shares:
-        axes[1].plot(steps, [float(row[name]) for row in table], ".-", label=name.split(":")[0])
-    axes[0].set(xlabel="step", title="losses", yscale="log")
-    axes[1].set(xlabel="step", title=trainer.task.measure, ylim=(0, 1))
-    if check:
-        width, place = 0.2, range(len(check))
-        for k, (what, when) in enumerate((w, t) for w in ("right", "aligned") for t in ("before", "after")):
-            values = [row[when][what] / row["pairs"] for row in check]
-            axes[2].bar([p + (k - 1.5) * width for p in place], values, width, label=f"{what} {when}",
-                        color=("0.8", "tab:blue", "0.6", "tab:green")[k])  # fmt: skip
-        axes[2].set_xticks(list(place), [f"{r['kind']}\n{r['overlap']} ({r['pairs']})" for r in check], fontsize=6)
-        axes[2].set(title="held-out pairs through align", ylim=(0, 1.05))
-    for a in axes:
-        a.legend(fontsize=6) if a.get_legend_handles_labels()[0] else None
-    with atomic_write(path / PLOT) as temporary:
-        figure.savefig(temporary, dpi=120, format="png")
+    with plots.figure(path / PLOT, plots.PAGE, 2.8) as figure:
+        panels = figure.subplots(1, 3 if check else 2)
+        panels[0].set(xlabel="step", title="losses", yscale="log")
+        panels[1].set(xlabel="step", title=trainer.task.measure, ylim=(-0.03, 1.03))
+        names = [n for n in table[0] if n.startswith("loss_")] or [n for n in table[-1] if n.startswith("loss_")]
+        plots.curves(panels[0], [column(table, steps, name, name[5:]) for name in names])
+        shares = [n for n in table[0] if n.endswith((": right matches", ": rank-1", ": success"))]
+        plots.curves(panels[1], [column(table, steps, name, name.split(":")[0]) for name in shares])
+        if check:
+            draw_check(panels[2], check)
+            panels[2].set(title="held-out pairs, before to after", xlim=(-0.02, 1.05))
     return ""
+
+
+def column(table: list[dict[str, str]], steps: list[int], name: str, label: str) -> plots.Series:
+    """A column of metrics.csv as a line, where it has values."""
+    known = [(step, float(row[name])) for step, row in zip(steps, table, strict=True) if row[name]]
+    return plots.Series(label, [x for x, _ in known], [y for _, y in known])
+
+
+def draw_check(panel: Any, check: list[dict[str, Any]]) -> None:
+    """Shares of held-out pairs that align gets right, and calls aligned: an arrow each from before to after."""
+    for place, row in enumerate(check):
+        for number, what in enumerate(("right", "aligned")):
+            before, after = (row[when][what] / row["pairs"] for when in ("before", "after"))
+            at, color = place + 0.3 * (number - 0.5), plots.COLORS[number]
+            panel.plot([before, after], [at, at], color=color)
+            panel.plot(before, at, "o", color=color, markerfacecolor="white")
+            panel.plot(after, at, "o", color=color)
+            if place == 0:
+                panel.annotate(what, (max(before, after), at), (5, 0), textcoords="offset points", va="center",
+                               color=color, fontsize=7)  # fmt: skip
+    panel.set_yticks(range(len(check)), [f"{r['kind']}\n{r['overlap']} ({r['pairs']})" for r in check], fontsize=6)
+    panel.invert_yaxis()
+    panel.set_xlabel("share of the pairs")
 
 
 def verdict(trainer: Trainer, stopped: bool) -> str:

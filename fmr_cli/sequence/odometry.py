@@ -18,7 +18,7 @@ import numpy as np
 from fmr_cli.errors import RegistrationError
 from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
-from fmr_cli.sequence.local_map import COARSE, FINE, REACH, WIDE, Fit, LocalMap, displacement
+from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
@@ -37,6 +37,8 @@ MIN_OVERLAP, MAX_COST = 0.35, 3.0
 OVERLAP_DROP = 0.5  # of the running median of overlaps, at least
 DOUBTFUL_OVERLAP, DOUBTFUL_TOTAL = 0.85, 1.25  # against the running medians: beyond, more starts are tried
 CONVINCING = 2.3  # a ``total`` for which one start is enough; right poses have up to 2.1, wrong ones from 2.9
+FALLEN = 0.7  # of the usual overlap: below it the registration onto the scan before is asked, whatever the starts say
+STRIKING = 1.5  # times the usual ``total``: beyond it one start is not enough
 TRUSTED_AFTER = 2  # aligned frames in a row, after which the prediction alone may do
 EXPECTED_ERROR = 3  # times the largest of the last prediction errors: so far may the next one be off
 # Times the distance from the map's planes, beyond which a scan held at the prediction does not fit there. In made-up
@@ -149,9 +151,10 @@ class Odometry:
         Where none fits the map, the registration onto the scan before counts, if its verdict is "aligned".
         """
         T_map_predicted, expected = next_frame.T_map_scan, EXPECTED_ERROR * max(self.errors, default=np.inf)
-        fits = []
+        # The widest level reaches far, and slides along a street: it only ever competes with the narrower ones.
+        fits = [] if expected < FINE else [self.map.fit(scan, T_map_predicted, (COARSE, FINE), "prediction")]
         if self.aligned > TRUSTED_AFTER:
-            fit = self.map.fit(scan, T_map_predicted, levels(expected), "prediction")
+            fit = fits[0] if fits else self.map.fit(scan, T_map_predicted, (FINE,), "prediction")
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
                 return fit
             fits = [fit]
@@ -162,16 +165,18 @@ class Odometry:
         fits += [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
         best = min(fits, key=lambda fit: fit.total)
         same = all(displacement(fit.T_map_scan, best.T_map_scan, scan.points) < FINE / 2 for fit in fits)
-        if self._fits(best) and ((len(fits) > 1 and same) or best.total < CONVINCING):
+        if self._fits(best) and not self._fallen(best) and ((len(fits) > 1 and same) or self._convincing(best)):
             return best
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
         best = min(best, by_features, key=lambda fit: fit.total)
-        if not self._fits(best) and found.status == "aligned":
-            same = displacement(by_features.T_map_scan, T_map_features, scan.points) < FINE
-            best = by_features if same else replace(by_features, T_map_scan=T_map_features)
-            best = replace(best, verified=True)
-        return best
+        if found.status != "aligned":
+            return best
+        if not self._fits(best):
+            best = by_features
+        if displacement(best.T_map_scan, T_map_features, scan.points) > FINE:
+            return best if self._fits(best) else replace(by_features, T_map_scan=T_map_features, verified=True)
+        return replace(best, verified=True)
 
     def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
@@ -184,6 +189,15 @@ class Odometry:
     def _fits(self, fit: Fit) -> bool:
         usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
         return fit.verified or (fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST)
+
+    def _fallen(self, fit: Fit) -> bool:
+        """Whether so little of the scan has a counterpart that starts which agree may all be wrong."""
+        return bool(self.usual) and fit.overlap < FALLEN * float(np.median([overlap for overlap, _ in self.usual]))
+
+    def _convincing(self, fit: Fit) -> bool:
+        """Whether a pose that one start alone has found needs no other opinion."""
+        usual = float(np.median([total for _, total in self.usual])) if self.usual else np.inf
+        return fit.total < min(CONVINCING, STRIKING * usual)
 
     def _usual(self, fit: Fit) -> bool:
         """Whether the fit is as good as the last ones; a scanner's rings on the ground hold it where it was, too."""
@@ -198,9 +212,12 @@ class Odometry:
         """
         assert self.motion
         usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
-        fit, slope = self.map.polish(scan, fit, usual_slope)
+        found, (fit, slope) = fit, self.map.polish(scan, fit, usual_slope)
         if np.isfinite(slope):
             self.slopes.append(slope)
+        if fit.verified:  # by the scan before, whatever little the map has there
+            same = fit.seen is not None and displacement(fit.T_map_scan, found.T_map_scan, scan.points) < FINE
+            return replace(fit, seen=fit.seen.as_observed()) if fit.seen and same else replace(found, rms=fit.rms)
         if fit.seen is None or fit.seen.observed.all():
             return fit
         elsewhere = self._observed_elsewhere(scan, fit, expected, usual_slope)
@@ -319,10 +336,3 @@ class Odometry:
         for index in state["map"]:
             self.map.insert(index, load(index), T_map_scan[index])
         self.last = (state["last"], load(state["last"]), T_map_scan[state["last"]])
-
-
-def levels(expected: float) -> tuple[float, ...]:
-    """The map's levels from which a pose is reached that the prediction misses by so many voxels, coarse to fine."""
-    if expected < FINE:
-        return (FINE,)
-    return (COARSE, FINE) if expected < COARSE * REACH else (WIDE, COARSE, FINE)

@@ -150,7 +150,7 @@ def begin(scans: Scans, options: SequenceOptions, known_map: PointCloud | None) 
         scan_times(cloud)  # says before anything is written that points have no times
     origin = np.median(cloud.points, axis=0)
     map_origin = np.median(known_map.points, axis=0) if known_map else origin
-    frame = VoxelFrame(options.voxel_size or choose_voxel(cloud.points), origin, map_origin)
+    frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size), origin, map_origin)
     return Beginning(frame, first_motion(scans, frame) if options.deskew else np.eye(4))
 
 

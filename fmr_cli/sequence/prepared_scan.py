@@ -28,6 +28,9 @@ SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from whic
 TILT = 3.0  # times the scan's median error, at which a normal is half trusted
 FEW = 512  # points that a scan's global feature is made of: enough to tell poses apart, 2 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
+# Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
+# no surface, and on coarser ones a scan slides.
+HINT = 1.25
 STEPS = 6  # of the search for the voxel, at most; each brings the count within a few percent
 COUNT_TOLERANCE = 0.1  # share by which the count may miss WORKING_POINTS
 # The count goes with the edge to the power of -1.5 to -2 (the rings of a LiDAR, a surface): -1 / 0.6 lies in between.
@@ -125,10 +128,11 @@ def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
     return scan if len(scan) >= MIN_POINTS else None
 
 
-def choose_voxel(points: np.ndarray) -> float:
+def choose_voxel(points: np.ndarray, wish: float | None = None) -> float:
     """The voxel edge that thins points (N, 3) to WORKING_POINTS, or to a quarter of them where they are few.
 
-    In the points' unit, to two digits. Raises RegistrationError where all points are in one place.
+    In the points' unit, to two digits. wish: an edge to be near to, within HINT. Raises RegistrationError where all
+    points are in one place.
     """
     wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
@@ -140,4 +144,6 @@ def choose_voxel(points: np.ndarray) -> float:
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
+    if wish is not None:
+        return float(np.clip(wish, voxel / HINT, voxel * HINT))
     return float(f"{voxel:.2g}")

@@ -163,7 +163,7 @@ class ScanRecipe:
     batch: int = 2  # pairs of a step
     temperature: float = 0.07  # of InfoNCE
     apart: float = 3.0  # voxel edges: nearer places are not each other's negatives
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4  # twice as much gains a little more on the scans and forgets three times as much
     whole_every: int = 5  # one step in so many is the global encoder's; 0 leaves it as it is
     steps: int = 1200
     epoch_steps: int = 100

@@ -148,17 +148,19 @@ def sure_links(survey: Survey) -> list[Link]:
     aligned = [link for link in survey.links.values() if link.status == "aligned"]
     pose = {link.ends: link.T_target_source for link in aligned}
     pose |= {(j, i): np.linalg.inv(T) for (i, j), T in pose.items()}
+    said = {ends: link.confidence for link in aligned for ends in (link.ends, link.ends[::-1])}
     kept = []
     for link in aligned:
         i, j = link.ends
         moment = survey.description(i, survey.edges[i]).moment
-        off = [
-            float(displacement(pose[k, j] @ pose[i, k], pose[i, j], moment))
-            for k in survey.edges
-            if (i, k) in pose and (k, j) in pose
-        ]
-        agree = sum(d < AGREE * TRIANGLE * link.edge for d in off)
-        deny = len(off) - agree
+        agree = deny = 0
+        for k in survey.edges:
+            if (i, k) in pose and (k, j) in pose:
+                off = float(displacement(pose[k, j] @ pose[i, k], pose[i, j], moment))
+                if off < AGREE * TRIANGLE * link.edge:
+                    agree += 1
+                elif min(said[i, k], said[k, j]) >= min(link.confidence, SURE):  # a doubtful link denies no sure one
+                    deny += 1
         if (link.confidence >= SURE and agree >= deny) or (agree >= CYCLES and not deny):
             kept.append(link)
     return sorted(kept, key=lambda link: (-link.confidence, link.ends))

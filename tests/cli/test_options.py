@@ -29,7 +29,7 @@ def test_every_option_arrives(fmr_here, monkeypatch):
     class SeenError(Exception):
         pass
 
-    def align(source, target, options):
+    def align(source, target, options, **_):
         raise SeenError(options)
 
     monkeypatch.setattr(pipeline, "align", align)

@@ -59,7 +59,8 @@ def chromium():
         options.add_argument(argument)  # fmt: skip
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     browser = webdriver.Chrome(options, webdriver.ChromeService(driver))
-    browser.set_page_load_timeout(240)
+    browser.command_executor.client_config.timeout = 400  # a busy machine draws slowly
+    browser.set_page_load_timeout(300)
     browser.set_script_timeout(120)
     yield browser
     browser.quit()

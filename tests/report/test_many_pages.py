@@ -207,6 +207,44 @@ def test_an_evaluation(tmp_path):
     assert line["high"][0] == 1.0
 
 
+def test_a_data_set(tmp_path):
+    from fmr_cli.evaluation.benchmark import Outcome, Summary
+    from fmr_cli.evaluation.quoted import Quoted
+    from fmr_cli.report.evaluation_page import write_dataset
+
+    shifts = [0.0, 0.1, 0.2, np.nan]
+    rows = [Outcome("s", EVIL, f"{n}", "fmr align", n < 2, float(n), shifts[n], np.nan, "aligned", 0.9, 1.0)
+            for n in range(4)]  # fmt: skip
+    data = SimpleNamespace(name="ETH", pairs=rows, right=SimpleNamespace(text="below 5 deg"), notes=[])
+    measured = [Summary("fmr align", 4, 0.5, 0.5, 1.0, 0.1, 0.5, 1.0, 1.0, 1.0, 0)]
+    quoted = [Quoted("ETH", "SpinNet", 73.07, 1.2, None, "somewhere")]
+    write_dataset(tmp_path / "d.html", data, measured, quoted, rows, {})  # type: ignore[arg-type]
+    text = (tmp_path / "d.html").read_text("utf-8")
+    rotation, shift = data_of(text)["groups"][0]["plots"]
+    assert rotation["series"][0]["values"] == [0.25, 0.5, 0.75, 1.0]
+    assert shift["series"][0]["values"] == [0.25, 0.5, 0.75]  # the one without a pose stays outside
+    assert re.findall(r'<tr data-status="(\w+)"', text) == ["wrong", "wrong", "right", "right"]
+    assert "quoted: somewhere" in text
+
+
+def test_the_plot_of_a_training_run(tmp_path):
+    from fmr_cli.report.training import plot
+
+    (tmp_path / "metrics.csv").write_text(
+        "epoch,step,loss_point,noise: success\n0,0,,0.5\n1,100,0.2,0.75\n2,200,0.1,0.8\n"
+    )
+    shares = {"before": {"right": 5, "aligned": 4}, "after": {"right": 8, "aligned": 4}}
+    rows = [{"kind": "room", "overlap": "10 to 30", "pairs": 10, **shares}]
+    for check in (None, {"rows": rows}):
+        trainer = SimpleNamespace(
+            folder=SimpleNamespace(path=tmp_path),
+            task=SimpleNamespace(measure="success"),
+            progress=SimpleNamespace(check=check),
+        )
+        assert plot(trainer) == ""  # type: ignore[arg-type]
+        assert (tmp_path / "training.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_a_training_run(tmp_path, monkeypatch):
     from fmr_cli.report import training_page
 
@@ -217,7 +255,7 @@ def test_a_training_run(tmp_path, monkeypatch):
     (tmp_path / "recipe.toml").write_text("# <b>\n")
     trainer = SimpleNamespace(
         folder=SimpleNamespace(path=tmp_path), quality=lambda epoch: (0.5 if epoch == 0 else 0.75,),
-        progress=SimpleNamespace(best=1, step=100, seconds=9.0, epoch=2, scores={}),
+        progress=SimpleNamespace(best=1, step=100, seconds=9.0, epoch=2, scores={}, check=None),
         task=SimpleNamespace(measure="success", measured="x", described=["y"]),
     )  # fmt: skip
     monkeypatch.setattr(training_page, "score_table", lambda _: [("noise", "0.5", "0.75")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from fmr_cli import PointCloud, write_cloud
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.errors import ModelError
+from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.registration.models import model
 from fmr_cli.synthetic import scenes
@@ -30,7 +32,7 @@ from fmr_cli.training.scan_views import (
     visible,
     whole_views,
 )
-from fmr_cli.training.self_registration import BLOCK, drawn, of_all_bands, register_scans
+from fmr_cli.training.self_registration import BLOCK, drawn, of_all_bands, parts, register_scans, sure_links
 
 CPU = torch.device("cpu")
 TINY = ScanRecipe(
@@ -78,6 +80,31 @@ def test_scans_register_themselves_and_every_pair_of_a_part_has_a_pose(files, fo
         assert angle_degrees(E) < 3
         assert 0.1 <= pair.overlap <= 1
     assert "pairs show one place" in found.said
+
+
+def test_a_wrong_link_that_is_not_sure_joins_nothing():
+    """Four scans round a cycle; a fifth link, aligned by half, says otherwise and is denied by its triangles."""
+    rng = np.random.default_rng(0)
+    poses = {}
+    for n in range(5):
+        poses[n] = np.eye(4)
+        poses[n][:3, :3], poses[n][:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 2, 3)
+    ends = {(1, 0): 0.95, (2, 1): 0.8, (2, 0): 0.95, (3, 2): 0.99, (3, 0): 0.75, (4, 3): 0.85}
+    links = {}
+    for (i, j), confidence in ends.items():
+        T = np.linalg.inv(poses[j]) @ poses[i]
+        T[:3, 3] += 3.0 * ((i, j) == (3, 0))  # the wrong one
+        links[i, j] = Link(i, j, "aligned", "look", [Hypothesis(T, confidence)], edge=0.05)
+    survey = SimpleNamespace(
+        links=links, edges=dict.fromkeys(range(5), 0.05), description=lambda n, edge: SimpleNamespace(moment=np.eye(4))
+    )
+    sure = sure_links(survey)
+    assert [link.ends for link in sure] == [(3, 2), (1, 0), (2, 0)]
+    [part] = parts(sure)
+    assert sorted(part) == [0, 1, 2, 3]
+    for i in part:
+        T = np.linalg.inv(part[0]) @ part[i]
+        np.testing.assert_allclose(T, np.linalg.inv(poses[0]) @ poses[i], atol=1e-9)
 
 
 def test_scans_that_share_nothing_and_broken_files_are_said(tmp_path, files):
