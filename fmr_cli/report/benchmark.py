@@ -29,20 +29,17 @@ def number(value: float | None, form: str) -> str:
 
 
 def table(dataset: DataSet, measured: Sequence[Summary], quoted: Sequence[Quoted]) -> Table:
-    """What was measured here, a line a method; then what others published, with where it stands below."""
-    shown = Table("method", "recall %", "RRE deg", "RTE", "precision", "aligned", "s a pair", "", title_justify="left")
-    shown.columns[0].no_wrap = True
+    """What was measured here, a line, and what others published, with where it stands."""
+    shown = Table("method", "recall %", "RRE deg", "RTE", "aligned: right", "share", "s a pair", "from")
     shown.title = f"{dataset.name}: {len(dataset.pairs)} pairs; right: {dataset.right.text}"
     for row in measured:
         verdict = [number(100 * x, ".1f") for x in (row.precision, row.share)]
         shown.add_row(row.method, number(100 * row.recall, ".1f"), number(row.rre, ".3f"), number(row.rte, ".4f"),
-                      *verdict, number(row.seconds, ".3f"))  # fmt: skip
+                      *verdict, number(row.seconds, ".3f"), "measured")  # fmt: skip
     shown.add_section()
-    sources = list(dict.fromkeys(other.source for other in quoted))
     for other in quoted:
         shown.add_row(other.method, number(other.recall, ".1f"), number(other.rre, ".3f"), number(other.rte, ".4f"),
-                      "", "", "", f"quoted [{sources.index(other.source) + 1}]", style="dim")  # fmt: skip
-    shown.caption = "\n".join(f"[{n}] {source}" for n, source in enumerate(sources, 1)) or None
+                      "", "", "", f"quoted: {other.source}", style="dim")  # fmt: skip
     return shown
 
 
@@ -79,23 +76,6 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]
 
 def plot(path: Path, dataset: DataSet, outcomes: Sequence[Outcome]) -> None:
     """The share of the pairs whose error is below a bound, over that bound: rotation and shift, a line a method."""
-<<<<<<< HEAD
-    panels = (("rre", "rotation error, deg"), ("rte", "shift, scans' unit"))
-    methods = list(dict.fromkeys(row.method for row in outcomes))
-    with plots.figure(path, plots.PAGE, 2.8) as figure:
-        axes = figure.subplots(1, len(panels), sharey=True)
-        for axis, (name, label) in zip(axes, panels, strict=True):
-            known = [e for row in outcomes if 0 < (e := getattr(row, name)) < np.inf] or [1.0]
-            low, high = max(float(np.quantile(known, 0.02)) / 2, 1e-6), 1.1 * max(known)
-            axis.set(xscale="log", xlabel=label, xlim=(low, high), ylim=(-0.03, 1.03))
-            for number, method in enumerate(methods):
-                error = np.sort([getattr(row, name) for row in outcomes if row.method == method])
-                style = plots.look(number) | {"marker": "", "label": method}
-                share = np.arange(len(error) + 1) / len(error)
-                axis.step(np.clip([low, *error], low, 10 * high), share, where="post", **style)
-        axes[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
-        axes[1].legend(fontsize="small", frameon=False)
-=======
     methods = list(dict.fromkeys(row.method for row in outcomes))
     with plots.figure(path, plots.PAGE, 2.9) as figure:
         panels = figure.subplots(1, 2, sharey=True)
@@ -112,4 +92,3 @@ def plot(path: Path, dataset: DataSet, outcomes: Sequence[Outcome]) -> None:
                 panel.set_xlim(max(np.quantile(finite, 0.02) / 2, 1e-6), max(finite) * 1.1)
         panels[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
         plots.names_above(figure, methods, lines=True)
->>>>>>> main
