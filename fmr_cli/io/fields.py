@@ -72,12 +72,13 @@ def refuse_degrees(names: Iterable[str]) -> None:
 def unique(names: Iterable[str]) -> list[str]:
     """The names, repeated ones told apart by a number: a, b, a -> a, b, a_2."""
     seen: set[str] = set()
+    last: dict[str, int] = {}  # number given to a name: a damaged header may repeat one 100,000 times
     result = []
     for name in names:
-        number, free = 1, name
+        free = name
         while free in seen:
-            number += 1
-            free = f"{name}_{number}"
+            last[name] = last.get(name, 1) + 1
+            free = f"{name}_{last[name]}"
         seen.add(free)
         result.append(free)
     return result
