@@ -6,6 +6,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import BinaryIO
 
 import numpy as np
@@ -42,6 +43,7 @@ TRIPLES = {
 }
 
 
+@lru_cache(maxsize=1 << 12)
 def plain(name: str) -> str:
     """A field's name without its unit, quotes and signs, in small letters: "X [m]", "x_coord", "Points:0"."""
     name = "".join(c for c in unicodedata.normalize("NFKD", name.lower()) if not unicodedata.combining(c))
