@@ -133,6 +133,8 @@ def writing_cost(folder: Path, pair: Pair, done: Done, count: int = 200) -> dict
 
 def on_paper(found: dict[str, Any]) -> list[dict[str, Any]]:
     """A million pairs on 1,000 cores: how long each part takes, if it had the whole time to itself."""
+    if missing := {"workers", "scheduler"} - set(found):
+        raise SystemExit(f"first: python -m benchmarks.scale {' and '.join(sorted(missing))}")
     pair = min(row["cpu s a pair"] for row in found["workers"])
     task = found["scheduler"][-1]
     row = found["writing"]

@@ -39,5 +39,10 @@ def test_the_wheel_holds_every_module(names):
     assert {path.relative_to(ROOT).as_posix() for path in (ROOT / "fmr_cli").rglob("*.py")} <= names
 
 
+def test_the_wheel_holds_what_pages_are_made_of(names):
+    made_of = {path.relative_to(ROOT).as_posix() for path in (ROOT / "fmr_cli/report/templates").iterdir()}
+    assert {"fmr_cli/report/templates/base.html", "fmr_cli/report/templates/common.js"} <= made_of <= names
+
+
 def test_the_wheel_installs_one_package(names):
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"fmr_cli"}

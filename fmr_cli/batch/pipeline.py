@@ -23,6 +23,7 @@ from fmr_cli.workers.local import on_this_machine
 
 MOST = 8  # pairs of a block, so that a kill loses little
 BLOCKS = 4  # for each worker, at least, so that none waits long for the last one
+MANY = 100  # pairs for each worker of a cluster, from which pairs that share no file go together too: fewer messages
 REMOTE_POINTS = 4_000_000  # that a worker process of a cluster keeps: 0.4 GB, whatever else runs there
 
 OnRow = Callable[[dict[str, Any], int, int], None]
@@ -66,7 +67,7 @@ def align_batch(
 
 def registered(runner: PairRunner, pairs: list[Pair], team: Workers, most: int) -> Generator[Done, None, None]:
     """What each pair has given, in the pairs' order; so many of them go to a worker at once."""
-    blocks = [*in_blocks(runner, pairs, most)]
+    blocks = [*in_blocks(runner, pairs, most, sharing=not team.remote or len(pairs) < MANY * team.count)]
     tasks = (seen_from_here(runner, block) for block in blocks) if team.remote else blocks
     with closing(team.run(runner.do, tasks)) as results:
         for block, done in zip(blocks, results, strict=True):
@@ -78,12 +79,13 @@ def registered(runner: PairRunner, pairs: list[Pair], team: Workers, most: int) 
                 yield from registered(runner, [*block.pairs], team, most=1)
 
 
-def in_blocks(runner: PairRunner, pairs: list[Pair], most: int) -> Iterator[Block]:
-    """Consecutive pairs, each of which shares a file with the one before, at most so many."""
+def in_blocks(runner: PairRunner, pairs: list[Pair], most: int, sharing: bool = True) -> Iterator[Block]:
+    """Consecutive pairs, at most so many; sharing: each of which shares a file with the one before."""
     last = {file: number for number, pair in enumerate(pairs) for file in runner.files(pair)}
     first = 0
     for end in range(1, len(pairs) + 1):
-        if end < len(pairs) and end - first < most and {*runner.files(pairs[end])} & {*runner.files(pairs[end - 1])}:
+        joins = end < len(pairs) and {*runner.files(pairs[end])} & {*runner.files(pairs[end - 1])}
+        if end < len(pairs) and end - first < most and (joins or not sharing):
             continue
         block = tuple(pairs[first:end])
         yield Block(block, frozenset(f for pair in block for f in runner.files(pair) if last[f] < end))

@@ -94,8 +94,6 @@ def evaluate_command(
     if dataset and experiments:
         raise FmrError("--dataset and --experiments: give one of the two; the experiments draw pairs of their own")
     name = dataset or (None if experiments else recognised(scans))
-    if name and report:
-        raise FmrError(f"--report shows experiments; what {name} gives is in results.csv and errors.png: leave it out")
     chosen = [] if name else chosen_experiments(experiments or EXPERIMENTS)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -107,11 +105,11 @@ def evaluate_command(
     )  # fmt: skip
     with chosen_workers(workers if workers > 1 or not dask else None, dask, quiet) as team:
         if name:
-            run_dataset(OnDataset(name, absolute(scans), compared, pairs), team, out, quiet)
+            run_dataset(OnDataset(name, absolute(scans), compared, pairs), team, out, quiet, report)
         else:
             plan = OnScans(absolute(scans), compared, clouds, pairs or PAIRS, points)
             rows = run_experiments(chosen, plan, team, out, quiet)
-    if report:
+    if report and not name:
         from fmr_cli.report.evaluation_page import write_evaluation
 
         said = {"scans": ", ".join(map(str, scans)), "methods": ", ".join(dict.fromkeys(row.method for row in rows))}
@@ -121,8 +119,10 @@ def evaluate_command(
     say(f"written to {out}", quiet=quiet)
 
 
-def run_dataset(plan: OnDataset, team: int | Workers | None, out: Path, quiet: bool) -> None:
-    """The methods on a data set: its table printed, results.csv, pairs.csv and a plot in ``out``."""
+def run_dataset(
+    plan: OnDataset, team: int | Workers | None, out: Path, quiet: bool, report: Path | None = None
+) -> None:
+    """The methods on a data set: its table printed, results.csv, pairs.csv and a plot in ``out``, and the report."""
     from fmr_cli.evaluation.benchmark import summarise
     from fmr_cli.evaluation.quoted import quoted
     from fmr_cli.report.benchmark import plot, table, write_pairs, write_results
@@ -137,6 +137,11 @@ def run_dataset(plan: OnDataset, team: int | Workers | None, out: Path, quiet: b
     write_results(out / "results.csv", data, measured, others)
     if can_plot():
         plot(out / "errors.png", data, rows)
+    if report:
+        from fmr_cli.report.evaluation_page import write_dataset
+
+        scans = ", ".join(map(str, plan.paths))
+        write_dataset(report, data, measured, others, rows, {"scans": scans, "data set": plan.name})
     Console(highlight=False).print(table(data, measured, others))
     unread = [row for row in rows if row.status == "failed"]
     if unread:

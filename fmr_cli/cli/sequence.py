@@ -37,7 +37,7 @@ def sequence_command(
         float | None, typer.Option(help="The map's voxel edge; half the working one if not given.", min=0.0)
     ] = None,
     voxel_size: Annotated[
-        float | None, typer.Option(help="The working voxel edge; from the data if not given.", min=0.0)
+        float | None, typer.Option(help="A wish for the working voxel edge, which the scans' density bounds.", min=0.0)
     ] = None,
     init_poses: Annotated[
         Path | None,
@@ -50,10 +50,11 @@ def sequence_command(
         bool, typer.Option("--loop-closure", help="Close loops in --out; the path before goes to NAME.odometry.*.")
     ] = False,
     deskew: Annotated[
-        bool, typer.Option("--deskew", help="Undo the motion within each scan, by the times of its points.")
-    ] = False,
+        bool | None,
+        typer.Option("--deskew/--no-deskew", help="Undo the motion within each scan; done if its points have times."),
+    ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="True poses, KITTI rows: errors beside --out as .evaluation.json and .png.")
+        Path | None, typer.Option(help="True poses (KITTI, TUM, .npy): errors and a plot beside --out.")
     ] = None,
     start: Annotated[int, typer.Option(help="The first scan, counted from 0.", min=0)] = 0,
     stop: Annotated[int | None, typer.Option(help="The scan before which to stop; none if not given.", min=0)] = None,
@@ -103,7 +104,7 @@ def read_truth(path: Path, found: Any) -> np.ndarray:
     """(n, 4, 4): the true poses of the chosen scans. Raises FmrError before anything is registered."""
     from fmr_cli.evaluation import trajectory
 
-    return trajectory.read_truth(path, found.chosen, found.total)
+    return trajectory.read_truth(path, found.chosen, found.total, found.times)
 
 
 def follow(bar: Progress, quiet: bool) -> Callable[[dict[str, Any], int, int], None]:

@@ -13,7 +13,7 @@ from fmr_cli.multiway.consistency import AGREE, Component, Join
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Apart, Network, Placed
 from fmr_cli.multiway.pose_graph import Factor, Prior, Solution
-from fmr_cli.multiway.survey import Survey
+from fmr_cli.multiway.survey import Survey, nearest_pairs
 
 LEAST_CONFIDENT = 0.1  # of a hypothesis that counts once the network agrees with it
 DOUBTFUL = 1.5  # voxel edges that a link may differ from what all others say, ...
@@ -166,12 +166,12 @@ def mean_pose(poses: list[np.ndarray]) -> np.ndarray:
 def refine(survey: Survey, component: Component, solution: Solution, anchor: int) -> joint.Refined:
     """All scans of a component at once, from the graph's poses."""
     poses, held = solution.T_component_scan, component.held or {anchor}
-    rejected = {(min(x.ends), max(x.ends)) for x in survey.links.values() if x.status == "rejected"}
+    rejected = {x.ends for x in survey.links.values() if x.status == "rejected"}
 
     def shared(i: int, j: int) -> float:
         return survey.overlap(i, j, np.linalg.inv(poses[j]) @ poses[i])
 
-    pairs = joint.partners(poses, shared, rejected)
+    pairs = joint.partners(nearest_pairs(poses, 3 * joint.PARTNERS), shared, rejected)
     numbers = sorted(poses)
     made = survey.each("refining", lambda n: joint.view(survey.store.prepared(n), survey.edges[n]), numbers)
     views = dict(zip(numbers, made, strict=True))

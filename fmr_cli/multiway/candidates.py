@@ -10,37 +10,48 @@ from fmr_cli.multiway.looks import Look
 from fmr_cli.multiway.survey import Ends, Survey, ends_of
 
 FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
-NEIGHBOURS = 16  # that most resemble a scan as places, looked at where there are more pairs than that
+NEIGHBOURS = 8  # that most resemble a scan as places, looked at at a time where there are more pairs than that
+PORTIONS = 4  # of so many neighbours, at most, for scans that are still apart
 PROMISING = 0.15  # a look's promise from which a pair is worth registering: pairs without overlap hardly reach it
 ROUGHLY_ONE_PLACE, ROUGHLY_CONTRADICTED = 0.006, 0.012  # as visibility.ONE_PLACE, CONTRADICTED, at a look's rough pose
 
 
 def look_at_pairs(survey: Survey) -> None:
-    """A cheap look at every pair where they are few, else at those that resemble each other as places."""
+    """A cheap look at every pair where they are few, else at those that most resemble each other as places."""
     numbers = sorted(survey.edges)
-    with survey.stage("look"):
-        pairs = all_pairs(survey) if len(numbers) * (len(numbers) - 1) <= 2 * FEW_PAIRS else alike_pairs(survey)
-        survey.looks = dict(zip(pairs, survey.each("looking", lambda p: look(survey, p), pairs), strict=True))
-    with survey.stage("see through"):
-        survey.each("finding viewpoints", survey.viewed, numbers)
-        discount_what_is_seen_through(survey)
+    if len(numbers) * (len(numbers) - 1) <= 2 * FEW_PAIRS:
+        look_at(survey, [(j, i) for n, i in enumerate(numbers) for j in numbers[n + 1 :] if survey.possible(j, i)])
+    else:
+        with survey.stage("look"):
+            alike = looks.similarity([survey.description(n) for n in numbers])
+            orders = (-alike).argsort(axis=1, kind="stable")
+            survey.alike = {i: [numbers[k] for k in orders[row] if k != row] for row, i in enumerate(numbers)}
+        look_further(survey)
 
 
-def all_pairs(survey: Survey) -> list[Ends]:
-    numbers = sorted(survey.edges)
-    return [(j, i) for n, i in enumerate(numbers) for j in numbers[n + 1 :] if survey.possible(j, i)]
-
-
-def alike_pairs(survey: Survey) -> list[Ends]:
-    """Each scan with the NEIGHBOURS that most resemble it as places."""
-    numbers = sorted(survey.edges)
-    alike = looks.similarity([survey.description(n) for n in numbers])
+def look_further(survey: Survey) -> bool:
+    """Looks at the next NEIGHBOURS of each scan that is not in the largest component; False if there are none left."""
+    largest = survey.components[0].T_component_scan if survey.components else {}
+    settled = largest if len(largest) > 1 else {}
     pairs: set[Ends] = set()
-    for row, i in enumerate(numbers):
-        order = [numbers[k] for k in (-alike[row]).argsort(kind="stable") if k != row]
-        possible = (ends_of(i, j) for j in order if survey.possible(*ends_of(i, j)))
-        pairs.update(pair for pair, _ in zip(possible, range(NEIGHBOURS), strict=False))
-    return sorted(pairs)
+    for i in sorted(survey.alike.keys() - settled.keys()):
+        for j in survey.alike[i][:NEIGHBOURS]:
+            pair = ends_of(i, j)
+            if pair not in survey.looks and survey.possible(*pair):
+                pairs.add(pair)
+        del survey.alike[i][:NEIGHBOURS]
+    look_at(survey, sorted(pairs))
+    return bool(pairs)
+
+
+def look_at(survey: Survey, pairs: list[Ends]) -> None:
+    """Takes in the looks at some pairs."""
+    with survey.stage("look"):
+        survey.looks.update(zip(pairs, survey.each("looking", lambda p: look(survey, p), pairs), strict=True))
+    with survey.stage("see through"):
+        promising = [p for p in pairs if survey.looks[p].promise >= PROMISING]
+        survey.each("finding viewpoints", survey.viewed, sorted({n for p in promising for n in p}))
+        discount_what_is_seen_through(survey, promising)
 
 
 def look(survey: Survey, pair: Ends) -> Look:
@@ -56,16 +67,15 @@ def every(found: Look) -> list[Look]:
     return [replace(x, others=()) for x in (found, *found.others)]
 
 
-def discount_what_is_seen_through(survey: Survey) -> None:
+def discount_what_is_seen_through(survey: Survey, pairs: list[Ends]) -> None:
     """Makes looks less promising where one scan sees through the other; a look's pose is rough, so not by much.
 
     Nothing is changed where even each scan's best look is contradicted: such scans weren't taken from one place.
     """
-    pairs = [p for p, x in survey.looks.items() if x.promise >= PROMISING]
 
     def shares(pair: Ends) -> list[float]:
         promising = [x for x in every(survey.looks[pair]) if x.promise >= PROMISING]
-        return [survey.seen_through(*pair, x.T_target_source) for x in promising]
+        return [survey.seen_through([(*pair, x.T_target_source)]) for x in promising]
 
     seen = dict(zip(pairs, survey.each("comparing views", shares, pairs), strict=True))
     telling = visibility.from_one_place(((p, min(found)) for p, found in seen.items()), ROUGHLY_ONE_PLACE)
@@ -77,8 +87,12 @@ def discount_what_is_seen_through(survey: Survey) -> None:
 
 
 def untried(survey: Survey, start: str, least: float = PROMISING) -> list[Ends]:
-    """Pairs of that promise which have not been registered from this kind of start, best first."""
-    pairs = [p for p, x in survey.looks.items() if x.promise >= least and (*p, start) not in survey.tried]
+    """Pairs of that promise which have not been registered from this kind of start, best first.
+
+    A look gives up the poses that have been tried, and its promise with them; of other starts a pair has one.
+    """
+    pairs = [p for p, x in survey.looks.items() if x.promise >= least]
+    pairs = [p for p in pairs if start == "look" or (*p, start) not in survey.tried]
     return sorted((p for p in pairs if p not in survey.never), key=lambda p: (-survey.looks[p].promise, p))
 
 

@@ -26,6 +26,7 @@ DENIALS = (
 )  # at so much overlap a link that found nothing is e^-x as likely if the join is right
 RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
 DENIED = 6.0  # log odds that a join loses by each link at whose pose one scan sees through the other
+MET = 10  # pairs of scans of two components whose views are compared before these are joined
 CERTAIN = 12.0  # log odds, at most, of one hypothesis
 
 
@@ -118,10 +119,12 @@ def joined(
     moments: dict[int, np.ndarray],
     overlap: Callable[[int, int, np.ndarray], float],
     fixed: Component | None = None,
+    seen_through: Callable[[list[tuple[int, int, np.ndarray]]], float] = lambda pairs: 0.0,
 ) -> tuple[list[Component], dict[tuple[int, int], Join]]:
     """Components of ``count`` scans, largest first, and the best join of each two that stay apart, by their places.
 
-    overlap: of two scans (source, target) at a pose. fixed: scans whose poses are given.
+    overlap: of two scans (source, target) at a pose. fixed: scans whose poses are given. seen_through: the share of the
+    scans of some pairs, each (source, target, pose), that the other one sees through.
     """
     components = {i: Component({i: np.eye(4)}) for i in range(count)}
     home = list(range(count))
@@ -131,30 +134,46 @@ def joined(
             del components[i]
             home[i] = first
         components[first] = Component(dict(fixed.T_component_scan), set(fixed.held))
-    every = claims(links, moments)
+    every, scans = claims(links, moments), telling(links)
     between: dict[tuple[int, int], list[Claim]] = defaultdict(list)
     for claim in every:
         a, b = sorted((home[links[claim.link].source], home[links[claim.link].target]))
         if a != b:
             between[a, b].append(claim)
     silent: dict[tuple[int, int], list[int]] = defaultdict(list)  # links, by number: for denials
+    speaking = {c.link for c in every if not c.contradicted}
     for number, link in enumerate(links):
         a, b = sorted((home[link.source], home[link.target]))
-        if a != b and link.status != "failed":
+        if a != b and link.status != "failed" and (number in speaking or not link.hypotheses):
             silent[a, b].append(number)
-    joins = {key: best_join(components[key[0]], components[key[1]], links, some, silent[key], moments, overlap)
-             for key, some in between.items()}  # fmt: skip
+
+    def best(key: tuple[int, int], exact: bool) -> Join:
+        tried = silent[key] if exact else []
+        return best_join(components[key[0]], components[key[1]], links, between[key], tried, moments, overlap)
+
+    # Denials are dear to work out and can but lower a join's odds: only for the join whose turn it is.
+    joins = {key: best(key, exact=False) for key in between}
+    exact: set[tuple[int, int]] = set()
     while True:
-        sure = [
+        hopeful = [
             (join.log_odds, -key[0], -key[1])
             for key, join in joins.items()
-            if join.probability >= JOINED and join.sound
+            if (join.probability >= JOINED and join.sound if key in exact else join.log_odds > 0)
         ]
-        if not sure:
+        if not hopeful:
             break
-        _, a, b = max(sure)
+        _, a, b = max(hopeful)
         a, b = -a, -b
+        if (a, b) not in exact:
+            joins[a, b] = best((a, b), exact=True)
+            exact.add((a, b))
+            continue
         T = joins[a, b].T_second_first
+        met = meeting(components[a], components[b], T, scans, moments)
+        given = any(links[n].start == "known" for n in joins[a, b].links)
+        if not given and seen_through(met) > CONTRADICTED:
+            joins[a, b] = replace(joins[a, b], denied=joins[a, b].denied + len(met), sound=False)
+            continue
         if components[b].held or (
             not components[a].held and len(components[b].T_component_scan) > len(components[a].T_component_scan)
         ):
@@ -163,18 +182,13 @@ def joined(
             keep, gone, T_keep_gone = a, b, np.linalg.inv(T)
         for i, pose in components[gone].T_component_scan.items():
             components[keep].T_component_scan[i] = T_keep_gone @ pose
-            home[i] = keep
-        del components[gone], joins[a, b]
-        between.pop((a, b))
-        touched = {keep}
-        for table in (between, silent):
-            touched |= rekeyed(table, gone, keep)
+        del components[gone], joins[a, b], between[a, b]
+        rekeyed(between, gone, keep)
+        rekeyed(silent, gone, keep)
         for key in [k for k in joins if gone in k]:
             del joins[key]
-        for key in [k for k in between if keep in k and (k[0] in touched and k[1] in touched)]:
-            joins[key] = best_join(
-                components[key[0]], components[key[1]], links, between[key], silent[key], moments, overlap
-            )
+        exact = {k for k in exact if keep not in k and gone not in k}
+        joins.update({key: best(key, exact=False) for key in between if keep in key})
     order = sorted(
         components, key=lambda c: (-len(components[c].T_component_scan), min(components[c].T_component_scan))
     )
@@ -183,16 +197,26 @@ def joined(
     return [components[c] for c in order], left
 
 
-def rekeyed(table: dict[tuple[int, int], list], gone: int, keep: int) -> set[int]:
-    """Moves what lies between ``gone`` and others to ``keep``; returns these others."""
-    others = set()
+def meeting(
+    first: Component, second: Component, T_second_first: np.ndarray, scans: set[int], moments: dict[int, np.ndarray]
+) -> list[tuple[int, int, np.ndarray]]:
+    """Pairs of two components at a join, each (source, target, pose), that lie closest for their size; of ``scans``."""
+    pairs = []
+    for i in sorted(scans & first.T_component_scan.keys()):
+        for j in sorted(scans & second.T_component_scan.keys()):
+            T = np.linalg.inv(second.T_component_scan[j]) @ T_second_first @ first.T_component_scan[i]
+            size = np.sqrt(np.trace(moments[i][:3, :3])) + np.sqrt(np.trace(moments[j][:3, :3]))
+            pairs.append((float(np.linalg.norm(T[:3, 3]) / size), i, j, T))
+    return [(i, j, T) for near, i, j, T in sorted(pairs, key=lambda p: p[:3])[:MET] if near < 1]
+
+
+def rekeyed(table: dict[tuple[int, int], list], gone: int, keep: int) -> None:
+    """Moves what lies between ``gone`` and others to ``keep``."""
     for key in [k for k in table if gone in k]:
         other = key[0] if key[1] == gone else key[1]
         if other != keep:
             table[min(keep, other), max(keep, other)].extend(table[key])
-            others.add(other)
         del table[key]
-    return others
 
 
 def best_join(
@@ -206,7 +230,7 @@ def best_join(
 ) -> Join:
     """The pose between two components that most speaks for; its rivals share the probability.
 
-    some: the claims between the two; tried: all links between them, those that found nothing too.
+    some: the claims between the two; tried: links between them that may deny it, those that found nothing too.
     """
     ranked = sorted(some, key=lambda c: (-c.log_odds, c.link, c.choice))
     T_join = np.stack([implied(first, second, links[c.link], c.choice) for c in ranked])  # second <- first
@@ -218,15 +242,18 @@ def best_join(
             continue
         agreed: dict[int, float] = {}
         contradicted: set[int] = set()
+        apart = np.zeros(len(ranked))  # sums of displacements between poses that agree with the lead
         for k, claim in enumerate(ranked):
             link = links[claim.link]
             scan = link.source if link.source in first.T_component_scan else link.target
             pose = first.T_component_scan[scan]
-            off = displacement(T_join[lead] @ pose, T_join[k] @ pose, moments[scan])
-            if off < AGREE * lenient * link.edge:
+            off = displacement(T_join @ pose, T_join[k] @ pose, moments[scan])
+            if off[lead] < AGREE * lenient * link.edge:
                 taken[k] = True
+                apart += np.minimum(off, AGREE * lenient * link.edge)
                 agreed[claim.link] = max(agreed.get(claim.link, -np.inf), claim.log_odds)
                 contradicted |= {claim.link} if claim.contradicted else set()
+        T_agreed = T_join[int(apart.argmin())]  # the pose in their middle: the lead may be a little wrong
         score = ranked[lead].log_odds
         score += sum(max(x - np.log(CHANCE), 0.0) for n, x in agreed.items() if n != ranked[lead].link)
         denied = len(contradicted)
@@ -234,13 +261,13 @@ def best_join(
         for number in [n for n in tried if n not in agreed][:DENIERS]:
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
-            T = T_join[lead] if A is first else np.linalg.inv(T_join[lead])
+            T = T_agreed if A is first else np.linalg.inv(T_agreed)
             shared = overlap(i, j, np.linalg.inv(B.T_component_scan[j]) @ T @ A.T_component_scan[i])
             penalty = next((x for least, x in DENIALS if shared >= least), 0.0)
             denied += penalty > 0
             score -= penalty
         sound = len(agreed) > 1 or links[ranked[lead].link].status == "aligned"
-        best.append(Join(T_join[lead], score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
+        best.append(Join(T_agreed, score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
     odds = np.exp(np.clip([join.log_odds for join in best], -50, 50))
     top = int(odds.argmax())
     rest = float(np.delete(odds, top).max()) if len(odds) > 1 else 0.0

@@ -73,14 +73,13 @@ def view(scan: Prepared, edge: float) -> View:
 
 
 def partners(
-    scans: Iterable[int], overlap: Callable[[int, int], float], excluded: set[tuple[int, int]]
+    pairs: Iterable[tuple[int, int]], overlap: Callable[[int, int], float], excluded: set[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """Pairs that share enough, at most PARTNERS a scan but for those that are another's best; (lower, higher)."""
-    scans = sorted(scans)
-    shares = {(i, j): overlap(i, j) for n, i in enumerate(scans) for j in scans[n + 1 :] if (i, j) not in excluded}
+    """Of pairs that may overlap those that share enough, at most PARTNERS a scan but for another's best."""
+    shares = {(i, j): overlap(i, j) for i, j in pairs if (i, j) not in excluded}
     kept: set[tuple[int, int]] = set()
-    for i in scans:
-        mine = sorted((pair for pair in shares if i in pair and shares[pair] >= LEAST), key=lambda p: (-shares[p], p))
+    for n in sorted({n for pair in shares for n in pair}):
+        mine = sorted((pair for pair in shares if n in pair and shares[pair] >= LEAST), key=lambda p: (-shares[p], p))
         kept.update(mine[:PARTNERS])
     return sorted(kept)
 
@@ -145,7 +144,8 @@ def refine(
         if factor == REACHES[-1] and moved < STILL:
             break
     if free and systems:
-        full = max(misfit(systems, floor, views), 1.0) * (B @ np.linalg.inv(normal) @ B.T)
+        inflation = max(misfit(systems, floor, views), 1.0) * repetition(systems, views)
+        full = inflation * (B @ np.linalg.inv(normal) @ B.T)
         covariance |= {i: full[place[i], place[i]] for i in free}
     for i in poses:
         mine = [s for s in systems if i in (s.source, s.target)] if pairs else []
@@ -188,6 +188,23 @@ def misfit(systems: list[System], floor: float, views: dict[int, View]) -> float
         kept = values > 1e-9 * values[-1]
         ratios.append(float((((V[:, kept].T @ b) ** 2) / values[kept]).sum() / max(kept.sum(), 1)))
     return float(np.median(ratios))
+
+
+def repetition(systems: list[System], views: dict[int, View]) -> float:
+    """By how much the normal equations count the same noise again; it multiplies the covariance.
+
+    Each pair is taken both ways, so that every residual stands in them twice. And a point's own noise goes into its
+    residuals against all k partners that see it, which the equations take for independent. Of k + 1 scans of one
+    surface, n points each with noise s², all k (k + 1) / 2 differences alike, least squares puts one scan against
+    another with a variance of 2 s² / n, whatever k; the equations, their pairs counted twice, say 2 s² / (n (k + 1)).
+    So k + 1, with k the mean over all points.
+    """
+    seen: dict[int, float] = {}
+    for s in systems:
+        seen[s.source] = seen.get(s.source, 0.0) + s.count / len(views[s.source].some)
+    weights = np.array([s.count for s in systems], float)
+    partners = np.average([max(seen[s.source], 1.0) for s in systems], weights=weights)
+    return float(partners + 1)
 
 
 def right_twist(start: np.ndarray, pose: np.ndarray) -> np.ndarray:

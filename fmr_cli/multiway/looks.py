@@ -14,9 +14,10 @@ from scipy.cluster.vq import kmeans2, vq
 from scipy.spatial import cKDTree
 
 from fmr_cli.descriptors.consensus import consensus
+from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.sampling import sample
-from fmr_cli.registration.models import bundled_local_encoder
+from fmr_cli.multiway.directions import main_directions, turned
 from fmr_cli.registration.prepared import LARGEST_RATIO, Prepared
 
 KEYPOINTS = 500
@@ -34,7 +35,7 @@ class Description:
 
     edge: of the voxels. keypoints (K, 3), descriptors (K, d). points (M, 3), normals (M, 3), tree: of the voxels.
     some: SAMPLE of their rows. moment: (4, 4) mean of homogeneous x xᵀ, which says how far two poses move the scan
-    apart (``displacement``). reach: of the point that is furthest from the centre.
+    apart (``displacement``). reach: of the point that is furthest from the centre. directions: see ``directions``.
     """
 
     edge: float
@@ -46,6 +47,7 @@ class Description:
     some: np.ndarray
     moment: np.ndarray
     reach: float
+    directions: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -57,17 +59,18 @@ class Look:
     others: tuple[Look, ...] = ()
 
 
-def describe(scan: Prepared, edge: float) -> Description:
+def describe(scan: Prepared, edge: float, encoder: LocalEncoder) -> Description:
     """The scan on a grid of ``edge``."""
-    keypoints, descriptors = scan.described(edge, KEYPOINTS, bundled_local_encoder())
+    keypoints, descriptors = scan.described(edge, KEYPOINTS, encoder)
     surface = scan.surface(edge)
     points = surface.points
     some = sample(np.arange(len(points)), SAMPLE, np.random.default_rng(scan.seed))
     x = np.hstack([points, np.ones((len(points), 1))])
     reach = float(np.linalg.norm(points, axis=1).max())
     return Description(
-        edge, keypoints, descriptors, points, surface.normals, surface.tree, some, x.T @ x / len(x), reach
-    )
+        edge, keypoints, descriptors, points, surface.normals, surface.tree, some, x.T @ x / len(x), reach,
+        main_directions(surface.normals),
+    )  # fmt: skip
 
 
 def shared_edges(own: Sequence[float]) -> list[float]:
@@ -84,6 +87,7 @@ def comparable(a: float, b: float) -> bool:
 def look(source: Description, target: Description, motion: Motion) -> Look:
     """Matched descriptors, each the other's nearest; the poses they agree on; how much of the source lies there.
 
+    Where both scans have main directions, also the poses that bring them together.
     motion: what may move, with its lift between the centred frames in edges.
     """
     similarity = source.descriptors @ target.descriptors.T
@@ -91,11 +95,15 @@ def look(source: Description, target: Description, motion: Motion) -> Look:
     mutual = np.flatnonzero(back[forth] == np.arange(len(forth)))
     edge = source.edge
     x, y = source.keypoints[mutual] / edge, target.keypoints[forth[mutual]] / edge
-    poses, votes = consensus(x, y, TOLERANCE, POSES, motion)
-    found = []
-    for T, count in zip(poses, votes, strict=True):
+    poses, _ = consensus(x, y, TOLERANCE, POSES, motion)
+    more = turned(source.keypoints / edge, target.keypoints / edge, similarity,
+                  (source.directions, target.directions), motion)  # fmt: skip
+    found: list[Look] = []
+    for T in np.concatenate([poses, more]):
+        count = int((np.linalg.norm(x @ T[:3, :3].T + T[:3, 3] - y, axis=1) < TOLERANCE).sum())
         T[:3, 3] *= edge
-        if count >= FEW:
+        known = any(displacement(T, k.T_target_source, source.moment) < 2 * TOLERANCE * edge for k in found)
+        if count >= FEW and not known:
             found.append(Look(float(coincidence(source, target, T) * np.sqrt(count)), T))
     return best_of(found)
 

@@ -13,7 +13,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import check_writable
 from fmr_cli.multiway import pose_graph
 from fmr_cli.multiway.adjustment import adjust
-from fmr_cli.multiway.candidates import look_at_pairs
+from fmr_cli.multiway.candidates import PORTIONS, look_at_pairs, look_further
 from fmr_cli.multiway.known import Known
 from fmr_cli.multiway.network import Network
 from fmr_cli.multiway.reading import prepare
@@ -55,6 +55,9 @@ def align_many(
         look_at_pairs(survey)
         register_most_promising(survey)
         join_components(survey)
+        for _ in range(PORTIONS - 1):
+            if len(survey.components) > 1 and look_further(survey):
+                join_components(survey)
         confirm(survey)
         if try_dear_starts(survey):
             join_components(survey)

@@ -15,6 +15,7 @@ from fmr_cli.io.files import reason
 from fmr_cli.multiway import consistency, pose_graph
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.links import Hypothesis, Link, best_of, key_of
+from fmr_cli.multiway.looks import best_of as best_look
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.multiway.store import Store
 from fmr_cli.multiway.survey import Survey, ends_of
@@ -47,7 +48,7 @@ def attempt(survey: Survey, source: int, target: int, start: str, T: np.ndarray 
 
 
 def from_look(survey: Survey, source: int, target: int) -> Attempt:
-    """A pair to register from the pose of its look: cheap where it is right, and where it is not."""
+    """A pair to register from the best pose of its look that is left: cheap where it is right, and where it is not."""
     return attempt(survey, source, target, "look", survey.looks[source, target].T_target_source)
 
 
@@ -125,6 +126,8 @@ def register_all(survey: Survey, attempts: list[Attempt]) -> None:
     for task in attempts:
         link = known[task.key]
         assert link is not None
+        if link.start == "look":  # another pose of the look may be tried in a later round
+            survey.looks[link.ends] = best_look(survey.looks[link.ends].others)
         survey.tried.add((*ends_of(*link.ends), link.start))
         kept = [h for h in link.hypotheses if survey.allowed(link.source, link.target, h.T_target_source)]
         if link.hypotheses and not kept:
@@ -146,7 +149,7 @@ def judge_views(survey: Survey) -> None:
     with survey.stage("see through"):
         new = [(link, h) for link in survey.links.values() for h in link.hypotheses if h.seen_through is None]
         shares = survey.each(
-            "comparing views", lambda x: survey.seen_through(x[0].source, x[0].target, x[1].T_target_source), new
+            "comparing views", lambda x: survey.seen_through([(*x[0].ends, x[1].T_target_source)]), new
         )
         for (_, h), share in zip(new, shares, strict=True):
             h.seen_through = share
@@ -156,7 +159,7 @@ def take_known_links(survey: Survey) -> None:
     """Links that are given, and those that are asked for."""
     for source, target, T in survey.given:
         if source in survey.edges and target in survey.edges:
-            pose = Hypothesis(enter_frames(T, survey.frames[source], survey.frames[target]), 1.0)
+            pose = Hypothesis(enter_frames(T, survey.frames[source], survey.frames[target]), 1.0, 0.0)
             edge = survey.pair_edge(source, target)
             sure = np.diag([1 / (edge / survey.radius(target)) ** 2] * 3 + [1 / edge**2] * 3)
             keep(survey, Link(source, target, "aligned", "known", [pose], sure, edge=edge, message="given"))
@@ -178,8 +181,9 @@ def join(survey: Survey) -> None:
     fixed = survey.fixed()
     given = Component({place[n]: T for n, T in fixed.items()}, {place[n] for n in fixed})
     found, survey.joins = consistency.joined(
-        len(order), links, moments, lambda i, j, T: survey.overlap(order[i], order[j], T), given
-    )
+        len(order), links, moments, lambda i, j, T: survey.overlap(order[i], order[j], T), given,
+        lambda pairs: survey.seen_through([(order[i], order[j], T) for i, j, T in pairs]),
+    )  # fmt: skip
     survey.components = [
         Component({order[k]: T for k, T in c.T_component_scan.items()}, {order[k] for k in c.held}) for c in found
     ]

@@ -11,9 +11,11 @@ import numpy as np
 from fmr_cli.multiway.candidates import leading_out, untried
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.registering import Attempt, attempt, from_look, register_all
-from fmr_cli.multiway.survey import Ends, Survey
+from fmr_cli.multiway.survey import Ends, Survey, nearest_pairs
 
 FIRST, NEXT = 3, 3  # promising pairs of a scan that are registered in the first round, of a component in each later one
+MANY, FIRST_OF_MANY = 50, 2  # scans from which rounds of joining are cheaper than a third pair for each at once
+NEAR = 16  # scans next to one in the network that may confirm where it is
 ROUNDS = 12  # of joining components, at most
 CONFIRMED = 3  # links of a scan that stop the search for more
 SHARED = 0.3  # overlap at the network's poses from which an untried pair is worth registering
@@ -25,8 +27,9 @@ def register_most_promising(survey: Survey) -> None:
     """Each scan's most promising pairs, and those whose known poses say that they overlap."""
     taken: dict[int, int] = {}
     chosen: set[Ends] = set()
+    first = FIRST if len(survey.edges) < MANY else FIRST_OF_MANY
     for pair in untried(survey, "look"):
-        if any(taken.get(n, 0) < FIRST for n in pair):
+        if any(taken.get(n, 0) < first for n in pair):
             chosen.add(pair)
             taken.update({n: taken.get(n, 0) + 1 for n in pair})
     attempts = [from_look(survey, *pair) for pair in sorted(chosen)]
@@ -64,14 +67,13 @@ def worth_confirming(survey: Survey, component: Component) -> list[Attempt]:
     steps = links_between(survey, members)
     degree = {n: sum(1 for m in members if steps.get((n, m)) == 1) for n in members}
     found = []
-    for k, j in enumerate(members):
-        for i in members[k + 1 :]:
-            few = min(degree[i], degree[j]) < CONFIRMED or steps.get((i, j), ROUND_TRIP) >= ROUND_TRIP
-            if few and (i, j) not in survey.links and survey.possible(i, j):
-                T = np.linalg.inv(poses[j]) @ poses[i]
-                shared = survey.overlap(i, j, T)
-                if shared >= SHARED:
-                    found.append((-shared, i, j, T))
+    for i, j in nearest_pairs(poses, NEAR):
+        few = min(degree[i], degree[j]) < CONFIRMED or steps.get((i, j), ROUND_TRIP) >= ROUND_TRIP
+        if few and (i, j) not in survey.links and survey.possible(i, j):
+            T = np.linalg.inv(poses[j]) @ poses[i]
+            shared = survey.overlap(i, j, T)
+            if shared >= SHARED:
+                found.append((-shared, i, j, T))
     count: dict[int, int] = {}
     chosen = []
     for _, i, j, T in sorted(found, key=lambda x: x[:3]):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 import fmr_cli
 from fmr_cli.errors import FmrError
@@ -25,6 +26,7 @@ from fmr_cli.multiway.scans import Scan
 from fmr_cli.multiway.store import Store
 from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import Options
+from fmr_cli.registration.models import local_encoder
 from fmr_cli.registration.prepared import pair_edge
 from fmr_cli.registration.result import plain
 
@@ -74,7 +76,10 @@ class Survey:
         self.edges: dict[int, float] = {}
         self.described: dict[tuple[int, float], looks.Description] = {}
         self.views: dict[int, visibility.Viewed] = {}
+        self.shared: dict[tuple[int, int, bytes], float] = {}  # overlaps that have been worked out already
+        self.through: dict[tuple[int, int, bytes], tuple[int, int]] = {}  # what has been compared already
         self.looks: dict[Ends, looks.Look] = {}
+        self.alike: dict[int, list[int]] = {}  # by scan, those that resemble it as places and wait for a look
         self.links: dict[Ends, Link] = {}
         self.tried: set[tuple[int, int, str]] = set()
         self.components: list[Component] = []
@@ -83,8 +88,10 @@ class Survey:
         self.journal = Journal(None if out is None else out / "journal.jsonl", self.settings())
         self.fixed_numbers = [number_of(name, scans, "--fixed") for name in dict.fromkeys(known.fixed)]
         self.anchor = None if known.anchor is None else number_of(known.anchor, scans, "--anchor")
-        told = {number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()}
-        self.poses = poses_in_file([scan.path for scan in scans]) | told
+        self.local = local_encoder(options.model)
+        self.poses = poses_in_file([scan.path for scan in scans]) | {
+            number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()
+        }
         self.never: set[Ends] = set()
         self.asked: list[tuple[int, int, np.ndarray | None]] = []  # "try" and "known" links: source, target, pose
         self.given: list[tuple[int, int, np.ndarray]] = []
@@ -149,7 +156,7 @@ class Survey:
         """What a look needs of a scan, on its own shared grid or one of ``edge``."""
         edge = edge or self.edges[number]
         if (number, edge) not in self.described:
-            self.described[number, edge] = looks.describe(self.store.prepared(number), edge)
+            self.described[number, edge] = looks.describe(self.store.prepared(number), edge, self.local)
         return self.described[number, edge]
 
     def moment(self, number: int) -> np.ndarray:
@@ -180,11 +187,20 @@ class Survey:
         a, b = self.description(source), self.description(target)
         if np.linalg.norm(T_target_source[:3, 3]) > a.reach + b.reach:
             return 0.0
-        return looks.overlap(a, b, T_target_source)
+        key = (source, target, T_target_source.tobytes())
+        if key not in self.shared:
+            self.shared[key] = looks.overlap(a, b, T_target_source)
+        return self.shared[key]
 
-    def seen_through(self, source: int, target: int, T_target_source: np.ndarray) -> float:
-        """The share of one scan that the other one sees through at a pose."""
-        return visibility.contradiction(self.viewed(source), self.viewed(target), T_target_source)
+    def seen_through(self, pairs: Iterable[tuple[int, int, np.ndarray]]) -> float:
+        """The share of the points of pairs (source, target, pose) that the other scan sees through, all together."""
+        counts = []
+        for source, target, T in pairs:
+            key = (source, target, T.tobytes())
+            if key not in self.through:
+                self.through[key] = visibility.contradiction(self.viewed(source), self.viewed(target), T)
+            counts.append(self.through[key])
+        return sum(x for x, _ in counts) / max(sum(said for _, said in counts), 1)
 
     def motion(self, source: int, target: int, unit: float = 1.0) -> Motion:
         """What may move between two centred frames, lengths in ``unit``."""
@@ -257,6 +273,14 @@ class Survey:
             for n, pose in sorted(self.poses.items())
             if n in self.edges and n not in self.fixed_numbers
         ]
+
+
+def nearest_pairs(T_component_scan: dict[int, np.ndarray], count: int) -> list[Ends]:
+    """Scans of a component, each with the ``count`` others whose centres are nearest; (higher, lower)."""
+    members = sorted(T_component_scan)
+    centres = np.stack([T_component_scan[n][:3, 3] for n in members])
+    near = cKDTree(centres).query(centres, min(count + 1, len(members)))[1].reshape(len(members), -1)
+    return sorted({ends_of(members[i], members[j]) for i, row in enumerate(near) for j in row if i != j})
 
 
 def size_of(path: Path | None) -> tuple[int, int] | None:

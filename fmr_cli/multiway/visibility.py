@@ -36,9 +36,9 @@ AS_GOOD = (
 SAMPLE = 4_000  # points that are brought into the other scan's view
 
 # Shares of points that are seen through, on the building of `python -m benchmarks.multiway` with viewpoints found
-# by the scans alone: right poses 0.000 to 0.011, wrong ones that fit well by surfaces and features 0.020 to 0.055.
-CONTRADICTED = 0.015  # takes as much off a pose's log odds as the surest link has; see ``doubt``
-ONE_PLACE = 0.004  # of each scan's best link, in the median: above it, scans were not taken from one place each
+# by the scans alone: right poses 0.000 to 0.005, wrong ones that fit well by surfaces and features 0.009 to 0.04.
+CONTRADICTED = 0.008  # takes as much off a pose's log odds as the surest link has; see ``doubt``
+ONE_PLACE = 0.003  # of each scan's best link, in the median: above it, scans were not taken from one place each
 
 _columns = np.maximum((2 * ROWS * np.sin((np.arange(ROWS) + 0.5) / ROWS * np.pi)).astype(int), 1)
 _first = np.concatenate([[0], np.cumsum(_columns)])  # number of each row's first cell
@@ -137,15 +137,15 @@ def cells(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return _first[row] + np.minimum((turn * _columns[row]).astype(int), _columns[row] - 1), distance
 
 
-def contradiction(source: Viewed, target: Viewed, T_target_source: np.ndarray) -> float:
-    """The larger share of one scan's points that the other sees through, of those it says anything about."""
-    return max(
-        seen_through(source, target, T_target_source), seen_through(target, source, np.linalg.inv(T_target_source))
-    )
+def contradiction(source: Viewed, target: Viewed, T_target_source: np.ndarray) -> tuple[int, int]:
+    """How many points of either scan the other one sees through at a pose, and how many it says anything about."""
+    one = seen_through(source, target, T_target_source)
+    other = seen_through(target, source, np.linalg.inv(T_target_source))
+    return one[0] + other[0], one[1] + other[1]
 
 
-def seen_through(scan: Viewed, by: Viewed, T_by_scan: np.ndarray) -> float:
-    """The share of a scan's points that the other one sees through, of those facing it that it says anything of."""
+def seen_through(scan: Viewed, by: Viewed, T_by_scan: np.ndarray) -> tuple[int, int]:
+    """How many of a scan's points the other one sees through, and how many it says anything about; they face it."""
     points = scan.some @ T_by_scan[:3, :3].T + T_by_scan[:3, 3]
     edge = max(scan.edge, by.edge)
     near = np.isfinite(by.tree.query(points, distance_upper_bound=NEAR * edge)[0])
@@ -153,7 +153,7 @@ def seen_through(scan: Viewed, by: Viewed, T_by_scan: np.ndarray) -> float:
     cell, distance = cells(rays)
     facing = np.abs(np.einsum("ni,ni->n", rays, scan.normals @ T_by_scan[:3, :3].T)) > FACING * distance
     through = facing & ~near & (by.count[cell] >= SEEN) & (by.nearest[cell] > distance + APART * edge)
-    return float(through.sum() / max((through | (near & facing)).sum(), 1))
+    return int(through.sum()), int((through | (near & facing)).sum())
 
 
 def from_one_place(shares: Iterable[tuple[tuple[int, int], float]], bound: float) -> set[int]:
@@ -176,5 +176,5 @@ def from_one_place(shares: Iterable[tuple[tuple[int, int], float]], bound: float
 
 
 def doubt(share: float) -> float:
-    """What a share takes off a pose's log odds: nothing up to half of CONTRADICTED, 12 at it, 24 at twice of it."""
-    return 0.0 if share < CONTRADICTED / 2 else 12.0 * share / CONTRADICTED
+    """What a share takes off a pose's log odds: 12 at CONTRADICTED, which no single link outweighs, by its square."""
+    return 12.0 * (share / CONTRADICTED) ** 2

@@ -83,7 +83,7 @@ class Prepared:
             index = surface.keypoints(count)
             return surface.points[index], encoder(describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS)))
 
-        return self._described.get((edge, count, id(encoder)), describe)
+        return self._described.get((edge, count, encoder.key), describe)
 
     def fine(self, count: int, edge: float) -> np.ndarray:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""

@@ -42,7 +42,8 @@ def write_batch(path: Path, folder: Path, out: Path, rows: Sequence[dict[str, An
     count = Counter(pair["status"] for pair in pairs)
     to_do, more = networks.doubtful(pairs)
     nodes = spanning_nodes(folder, pairs, poses)
-    data = networks.network_data(nodes, pairs) if nodes else {"nodes": [], "links": [], "seen": "", "layout_words": ""}
+    nothing: dict[str, Any] = {"nodes": [], "links": [], "seen": "", "layout_words": ""}
+    data = networks.network_data(nodes, pairs) if nodes else nothing
     if nodes:
         data["layout_words"] += " Placed by the surest links, without an adjustment; fmr multiway does better."
     settings = out / "settings.json"

@@ -16,6 +16,7 @@ from fmr_cli.evaluation.benchmark import Outcome, Summary
 from fmr_cli.evaluation.datasets.pair import DataSet
 from fmr_cli.evaluation.quoted import Quoted
 from fmr_cli.io.files import atomic_write
+from fmr_cli.report import plots
 
 COLUMNS = (
     "dataset", "method", "measured", "pairs", "recall", "recall_of_pairs", "rre_deg", "rte", "precision_of_aligned",
@@ -75,19 +76,19 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]
 
 def plot(path: Path, dataset: DataSet, outcomes: Sequence[Outcome]) -> None:
     """The share of the pairs whose error is below a bound, over that bound: rotation and shift, a line a method."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((10, 4), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, name, label in zip(axes, ("rre", "rte"), ("rotation error, deg", "shift, scans' unit"), strict=True):
-        for method in dict.fromkeys(row.method for row in outcomes):
-            error = np.sort([getattr(row, name) for row in outcomes if row.method == method])
-            axis.step(np.maximum(error, 1e-9), np.arange(1, len(error) + 1) / len(error), where="post", label=method)
-        finite = [e for row in outcomes if np.isfinite(e := getattr(row, name)) and e > 0]
-        axis.set(xscale="log", xlabel=label, ylim=(-0.02, 1.02))
-        if finite:
-            axis.set_xlim(max(np.quantile(finite, 0.02) / 2, 1e-6), max(finite) * 1.1)
-    axes[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
-    axes[0].legend(fontsize="small")
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    methods = list(dict.fromkeys(row.method for row in outcomes))
+    with plots.figure(path, plots.PAGE, 2.9) as figure:
+        panels = figure.subplots(1, 2, sharey=True)
+        for panel, name, label in zip(
+            panels, ("rre", "rte"), ("rotation error, deg", "shift, scans' unit"), strict=True
+        ):
+            for number_, method in enumerate(methods):
+                error = np.sort([getattr(row, name) for row in outcomes if row.method == method])
+                style = {k: v for k, v in plots.look(number_).items() if k != "marker"}
+                panel.step(np.maximum(error, 1e-9), np.arange(1, len(error) + 1) / len(error), where="post", **style)
+            finite = [e for row in outcomes if np.isfinite(e := getattr(row, name)) and e > 0]
+            panel.set(xscale="log", xlabel=label, ylim=(-0.02, 1.02))
+            if finite:
+                panel.set_xlim(max(np.quantile(finite, 0.02) / 2, 1e-6), max(finite) * 1.1)
+        panels[0].set(ylabel="share of the pairs", title=f"{dataset.name}, {len(dataset.pairs)} pairs")
+        plots.names_above(figure, methods, lines=True)

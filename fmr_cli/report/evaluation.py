@@ -47,7 +47,7 @@ def series(rows: list[Row], measure: str) -> list[Series]:
     sets = {r.clouds for r in rows}
     found = []
     for clouds, method in dict.fromkeys((r.clouds, r.method) for r in rows):
-        own = [r for r in rows if (r.clouds, r.method) == (clouds, method)]
+        own = sorted((r for r in rows if (r.clouds, r.method) == (clouds, method)), key=lambda r: r.level)
         values = [float(getattr(r, measure)) for r in own]
         low, high = zip(*(binomial(r.success, r.pairs) for r in own), strict=True)
         bounds = (low, high) if measure == "success" else (None, None)

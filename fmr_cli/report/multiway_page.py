@@ -71,7 +71,8 @@ def write_multiway(path: Path, network: Network, words: Sequence[str] = ()) -> N
         scans=[scan_row(scan) for scan in network.scans], scan_columns=SCANS,
         scan_statuses=sorted({scan.status for scan in network.scans}), doubtful=to_do, more_doubtful=more,
         components=[component_name(n, anchor) for n, anchor in enumerate(network.anchors)],
-        settings={name: value for name, value in network.settings.items() if name != "scans"}, seconds=network.seconds, versions=versions(),
+        settings={name: value for name, value in network.settings.items() if name != "scans"},
+        seconds=network.seconds, versions=versions(),
     )  # fmt: skip
 
 
@@ -104,6 +105,6 @@ def link_row(link: Link, network: Network, number: int) -> dict[str, Any]:
         "overlap": float(link.overlap), "inlier_rmse": networks.number_of(link.inlier_rmse or None),
         "residual_rot_deg": networks.number_of(link.residual_rot_deg),
         "residual_shift": networks.number_of(link.residual_shift), "message": link.message,
-        "strength": " ".join(f"{x:.0f}" for x in share) + " %" if share is not None else "–",
+        "strength": " ".join(f"{x:.0f}" for x in share) + " %" if share is not None else "\u2013",
         "what": WHAT["used" if used else link.status] if link.status in WHAT else "",
     }  # fmt: skip

@@ -21,8 +21,9 @@ from fmr_cli.io.outputs import check_outputs
 
 NEEDED = {"jinja2": "Jinja2", "plotly": "plotly", "PIL": "pillow"}  # module -> package
 STATUS = {  # of a pair, a link, a scan, a frame: a class for the colour, and a shape for those who see none
-    "aligned": ("good", "✔"), "placed": ("good", "✔"), "known": ("good", "✔"), "uncertain": ("doubtful", "▲"),
-    "unplaced": ("doubtful", "▲"), "rejected": ("bad", "✖"), "failed": ("bad", "✖"),
+    "aligned": ("good", "✔"), "placed": ("good", "✔"), "known": ("good", "✔"), "right": ("good", "✔"),
+    "uncertain": ("doubtful", "▲"), "unplaced": ("doubtful", "▲"), "wrong": ("bad", "✖"), "rejected": ("bad", "✖"),
+    "failed": ("bad", "✖"),
 }  # fmt: skip
 
 
@@ -65,14 +66,15 @@ def own(name: str) -> str:
 def plotly_js() -> str:
     """The library as the plotly package brings it, read without importing that package."""
     spec = importlib.util.find_spec("plotly")
-    assert spec and spec.submodule_search_locations
+    assert spec is not None
+    assert spec.submodule_search_locations
     return (Path(spec.submodule_search_locations[0]) / "package_data" / "plotly.min.js").read_text("utf-8")
 
 
 def number(value: Any, digits: int = 4) -> str:
     """A number for a table; what is not there or not finite as a dash."""
     if value is None or value == "" or (isinstance(value, float) and not math.isfinite(value)):
-        return "–"
+        return "\u2013"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):

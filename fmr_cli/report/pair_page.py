@@ -166,5 +166,5 @@ def file_row(role: str, cloud: PointCloud) -> dict[str, Any]:
     return {
         "role": role, "file": cloud.name, "points": cloud.count, "used": len(cloud), "dropped": cloud.dropped,
         "format": cloud.format or "", "layout": cloud.layout or "", "crs": (cloud.crs or "")[:80],
-        "extent": " × ".join(f"{x:.4g}" for x in np.ptp(cloud.points, axis=0)),
+        "extent": " \u00d7 ".join(f"{x:.4g}" for x in np.ptp(cloud.points, axis=0)),
     }  # fmt: skip

@@ -39,7 +39,7 @@ def write_picture(path: Path, source: PointCloud, target: PointCloud, found: Reg
         clouds(panels[0, 0], fixed[:POINTS, axes], (moving - middle)[:POINTS, axes], f"before, {top}", axes)
         clouds(panels[0, 1], fixed[:POINTS, axes], after[:POINTS, axes], f"after, {top}", axes)
         cut = [p[np.abs(p[:, along] - at) <= thick / 2][:, axes] for p in (fixed, after)]
-        clouds(panels[1, 0], *cut, f"after, section at {'xyz'[along]} = {at:.3g}", axes, size=1.5)
+        clouds(panels[1, 0], cut[0], cut[1], f"after, section at {'xyz'[along]} = {at:.3g}", axes, size=1.5)
         residuals(panels[1, 1], error.plane[touching], reference)
         figure.suptitle(
             f"{found.status}, confidence {found.confidence:.2f}: overlap {found.overlap:.0%}, "

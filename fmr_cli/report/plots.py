@@ -149,11 +149,12 @@ def dots(axes: Any, rows: Sequence[str], series: Sequence[Series]) -> None:
         axes.axhline(row - 0.5, color="#e3e6ea", linewidth=0.5, zorder=0)
 
 
-def names_above(figure: Any, labels: Sequence[str]) -> None:
-    """The series' names in their colours with their markers, in one line above all panels."""
+def names_above(figure: Any, labels: Sequence[str], lines: bool = False) -> None:
+    """The series' names in their colours with their markers, or lines, in one line above all panels."""
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], **{**look(n), "linestyle": ""}, label=label) for n, label in enumerate(labels)]
+    without = {"marker": ""} if lines else {"linestyle": ""}
+    handles = [Line2D([], [], **{**look(n), **without}, label=label) for n, label in enumerate(labels)]
     figure.legend(handles=handles, loc="outside upper left", ncols=len(labels), frameon=False, labelcolor="linecolor",
                   handletextpad=0.2, columnspacing=1.2)  # fmt: skip
 

@@ -49,7 +49,7 @@ def write_sequence(path: Path, result: SequenceResult, scans: Scans, options: Se
         title=f"Sequence of {len(result.rows)} scans", status=result.status, words=result.summary(), figures=[
             (str(count["aligned"]), "frames aligned"), (str(count["uncertain"]), "frames uncertain"),
             (f"{length:.4g}", "length of the path"), (f"{result.voxel_size:.3g}", "working voxel edge"),
-            (f"{np.median(residuals):.3g}" if residuals else "–", "residual, median"),
+            (f"{np.median(residuals):.3g}" if residuals else "\u2013", "residual, median"),
             (str(result.loops) if before is not None else "not asked for", "loops closed"),
         ],
         rows=table_rows(result.rows), columns=COLUMNS, statuses=[s for s in ("uncertain", "aligned") if count[s]],

@@ -12,10 +12,17 @@ from fmr_cli.report.networks import column, number_of
 from fmr_cli.report.page import write_page
 from fmr_cli.report.training import verdict
 from fmr_cli.training.loop import Trainer
-from fmr_cli.training.run import score_table
+from fmr_cli.training.run import check_cells, score_table
 from fmr_cli.training.run_folder import CARD, METRICS, RECIPE
 
 SCORES = (column("setting", "Held out", "name"), column("start", "Start", "short"), column("kept", "Kept", "short"))
+
+CHECKED = (
+    column("kind", "Pairs of", "name"), column("overlap", "Overlap", "short"), column("pairs", "Pairs", "short"),
+    column("right", "Right", "short"), column("aligned", "Aligned", "short"),
+    column("wrong", "Wrong, yet aligned", "short"), column("matches", "Right matches", "short"),
+    column("degrees", "Error, deg", "short"),
+)  # fmt: skip
 
 
 def write_training(path: Path, trainer: Trainer, stopped: bool) -> None:
@@ -34,11 +41,21 @@ def write_training(path: Path, trainer: Trainer, stopped: bool) -> None:
             (str(progress.best), "epoch kept"), (str(progress.step), "steps"),
             (f"{progress.seconds / 60:.1f}", "minutes"),
         ],
-        tables={}, more_tables=[{"title": "Before and after", "columns": SCORES, "rows": scores,
-                                 "caption": trainer.task.measured}],
+        tables={}, more_tables=[{"title": "Before and after", "columns": SCORES, "rows": scores, "statuses": (),
+                                 "caption": trainer.task.measured}, *checked(trainer)],
         texts=[(name, (folder / name).read_text("utf-8")) for name in (CARD, RECIPE) if (folder / name).is_file()],
         settings={"learns from": "; ".join(trainer.task.described), "folder": str(folder)}, versions=versions(),
     )  # fmt: skip
+
+
+def checked(trainer: Trainer) -> list[dict[str, Any]]:
+    """The table of held-out pairs through ``align``; none where none were registered."""
+    if not trainer.progress.check or not trainer.progress.check["rows"]:
+        return []
+    rows = [dict(zip((c["key"] for c in CHECKED), cells, strict=True)) | {"status": "", "id": ""}
+            for cells in check_cells(trainer.progress.check)]  # fmt: skip
+    return [{"title": "Held-out pairs through align", "columns": CHECKED, "rows": rows, "statuses": (),
+             "caption": "Before to after training."}]  # fmt: skip
 
 
 def groups(rows: list[dict[str, str]], measure: str) -> list[dict[str, Any]]:

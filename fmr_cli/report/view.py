@@ -31,7 +31,7 @@ STEP = 0.01  # of the size: by which a key moves a section
 # Of clouds by file: those of the reports, then others told apart with every kind of colour vision (Okabe and Ito)
 HUES = np.array([TARGET, SOURCE, (0, 158, 115), (204, 121, 167), (86, 180, 233), (120, 94, 240)]) / 255
 # From few to many, light growing evenly enough to read in grey; the same on pages (clouds.js)
-RAMP = np.array([(13, 59, 140), (42, 143, 189), (143, 199, 122), (242, 193, 78), (200, 50, 31)]) / 255
+RAMP = np.array([(36, 92, 190), (42, 143, 189), (143, 199, 122), (242, 193, 78), (200, 50, 31)]) / 255
 SCREEN = (1280, 960)
 
 

@@ -18,16 +18,19 @@ VERDICTS = {
 }
 # A piece of a reason (see ``registration.confidence.doubts``) -> what to do about it
 ADVICE = (
-    ("do not determine", "Along the arrows the scans look the same wherever the source is. Add a scan that shows an end "
-     "or a corner, or bound the motion with --dof, --max-shift or a pose that you know (--init)."),
+    ("do not determine", "Along the arrows the scans look the same wherever the source is. Add a scan that shows an "
+     "end or a corner, or bound the motion with --dof, --max-shift or a pose that you know (--init)."),
     ("fits about as well", "Switch between the poses below and look which one is right; its matrix, saved to a file, "
      "can be given with --init."),
-    ("contradicts the pose", "Look at the section for surfaces that cross, or that float before one another. Things that "
-     "moved between the scans also do this."),
+    ("contradicts the pose", "Look at the section for surfaces that cross, or that float before one another. Things "
+     "that moved between the scans also do this."),
     ("scaled by", "If the two were not measured in one scale, register them with --scale."),
-    ("as far apart as", "The surfaces do not meet as closely as the scans are smooth: one may be bent, drifted or noisy."),
-    ("of the smaller scan lies on", "There is little that both scans saw. A scan taken in between gives two sure links."),
-    ("matches of local features", "Few places look alike in both scans: little overlap, few points, or another place."),
+    ("as far apart as", "The surfaces do not meet as closely as the scans are smooth: one may be bent, drifted or "
+     "noisy."),
+    ("of the smaller scan lies on", "There is little that both scans saw. A scan taken in between gives two sure "
+     "links."),
+    ("matches of local features", "Few places look alike in both scans: little overlap, few points, or another "
+     "place."),
     ("voxel", "Check that both files are in one unit and show one place."),
 )  # fmt: skip
 EVIDENCE = {

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fmr_cli.errors import RegistrationError
+from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
-from fmr_cli.sequence.local_map import COARSE, FINE, REACH, WIDE, Fit, LocalMap, displacement
+from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
@@ -36,6 +37,8 @@ MIN_OVERLAP, MAX_COST = 0.35, 3.0
 OVERLAP_DROP = 0.5  # of the running median of overlaps, at least
 DOUBTFUL_OVERLAP, DOUBTFUL_TOTAL = 0.85, 1.25  # against the running medians: beyond, more starts are tried
 CONVINCING = 2.3  # a ``total`` for which one start is enough; right poses have up to 2.1, wrong ones from 2.9
+FALLEN = 0.7  # of the usual overlap: below it the registration onto the scan before is asked, whatever the starts say
+STRIKING = 1.5  # times the usual ``total``: beyond it one start is not enough
 TRUSTED_AFTER = 2  # aligned frames in a row, after which the prediction alone may do
 EXPECTED_ERROR = 3  # times the largest of the last prediction errors: so far may the next one be off
 # Times the distance from the map's planes, beyond which a scan held at the prediction does not fit there. In made-up
@@ -46,10 +49,9 @@ FINEST = 0.05
 # Voxels: an unobserved direction whose sigma is beyond it could matter. Half the voxel that everything here is measured
 # by: 0.05 m for a depth camera in a room, 0.2 m for a LiDAR in a street.
 MATTERS = 0.5
+ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
-
-FeatureErrors = tuple[float, float] | None
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,10 @@ class Frame:
     T_first_scan: (4, 4) float64, file units. status: "aligned", or "uncertain": the pose is then the prediction, and
     the scan is kept out of the map. overlap: share of its points with a counterpart on the map. inlier_rmse: their
     root mean square distance from the map's local planes, file units. start: where the accepted pose came from
-    ("first", "prediction", "zero-motion", "features"). feature_errors: before and after, where the feature-metric
-    registration was asked. unobserved: directions along which the scan does not tell its pose, in the first scan's
-    axes ("shift along (1.00, 0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once
-    sigma_shift (file units) or sigma_rotation (degrees), the pose's standard deviations along the worst direction,
-    could matter.
+    ("first", "prediction", "zero-motion", "features"). feature_errors: see ``feature_error``, by the last usable scan.
+    unobserved: directions along which the scan does not tell its pose, in the first scan's axes ("shift along (1.00,
+    0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once sigma_shift (file units) or
+    sigma_rotation (degrees), the pose's standard deviations along the worst direction, could matter.
     """
 
     T_first_scan: np.ndarray
@@ -71,7 +72,7 @@ class Frame:
     overlap: float
     inlier_rmse: float
     start: str
-    feature_errors: FeatureErrors = None
+    feature_errors: tuple[float, float] | None = None
     unobserved: tuple[str, ...] = ()
     sigma_shift: float = 0.0
     sigma_rotation: float = 0.0
@@ -103,13 +104,17 @@ class Odometry:
             return self._begin(index, scan, np.eye(4))
         expected = self.motion.expect(told, pace)
         if scan is None:
-            return self._bridge(index, None, expected, Fit(expected.T_map_scan, 0.0, np.nan, "prediction"), None)
-        fit, feature_errors = self._best_fit(scan, expected)
-        if not self._fits(fit):
-            return self._bridge(index, scan, expected, fit, feature_errors)
-        fit = self._polished(scan, fit, expected)
-        self._accept(index, scan, expected, fit)
-        return self._frame(scan, fit, feature_errors)
+            return self._bridge(index, None, expected, Fit(expected.T_map_scan, 0.0, np.nan, "prediction"))
+        _, last, T_map_last = self.last
+        fit = self._best_fit(scan, expected)
+        if self._fits(fit):
+            fit = self._polished(scan, fit, expected)
+            self._accept(index, scan, expected, fit)
+            frame = self._frame(fit)
+        else:
+            frame = self._bridge(index, scan, expected, fit)
+        T_last_scan = np.linalg.inv(T_map_last) @ self.motion.T_map_scan
+        return replace(frame, feature_errors=feature_errors(last, scan, T_last_scan))
 
     def begin_in_map(self, scan: PreparedScan | None, T_map_guess: np.ndarray | None) -> Frame:
         """The first frame, in the known map: near a guess (4, 4), or found by registration.
@@ -140,17 +145,18 @@ class Odometry:
         self.last, self.aligned = (index, scan, T_map_scan), 1
         return Frame(self.frame.pose_to_file(T_map_scan), "aligned", 1.0, 0.0, "first")
 
-    def _best_fit(self, scan: PreparedScan, next_frame: Expected) -> tuple[Fit, FeatureErrors]:
+    def _best_fit(self, scan: PreparedScan, next_frame: Expected) -> Fit:
         """Trust the prediction while predictions have been good; else compare starts by what they come to.
 
         Where none fits the map, the registration onto the scan before counts, if its verdict is "aligned".
         """
         T_map_predicted, expected = next_frame.T_map_scan, EXPECTED_ERROR * max(self.errors, default=np.inf)
-        fits = []
+        # The widest level reaches far, and slides along a street: it only ever competes with the narrower ones.
+        fits = [] if expected < FINE else [self.map.fit(scan, T_map_predicted, (COARSE, FINE), "prediction")]
         if self.aligned > TRUSTED_AFTER:
-            fit = self.map.fit(scan, T_map_predicted, levels(expected), "prediction")
+            fit = fits[0] if fits else self.map.fit(scan, T_map_predicted, (FINE,), "prediction")
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
-                return fit, None
+                return fit
             fits = [fit]
         assert self.motion
         starts = {"zero-motion": self.motion.T_map_scan}
@@ -159,16 +165,18 @@ class Odometry:
         fits += [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
         best = min(fits, key=lambda fit: fit.total)
         same = all(displacement(fit.T_map_scan, best.T_map_scan, scan.points) < FINE / 2 for fit in fits)
-        if self._fits(best) and ((len(fits) > 1 and same) or best.total < CONVINCING):
-            return best, None
+        if self._fits(best) and not self._fallen(best) and ((len(fits) > 1 and same) or self._convincing(best)):
+            return best
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
         best = min(best, by_features, key=lambda fit: fit.total)
-        if not self._fits(best) and found.status == "aligned":
-            same = displacement(by_features.T_map_scan, T_map_features, scan.points) < FINE
-            best = by_features if same else replace(by_features, T_map_scan=T_map_features)
-            best = replace(best, verified=True)
-        return best, (found.feature_error_before, found.feature_error_after)
+        if found.status != "aligned":
+            return best
+        if not self._fits(best):
+            best = by_features
+        if displacement(best.T_map_scan, T_map_features, scan.points) > FINE:
+            return best if self._fits(best) else replace(by_features, T_map_scan=T_map_features, verified=True)
+        return replace(best, verified=True)
 
     def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
@@ -182,6 +190,15 @@ class Odometry:
         usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
         return fit.verified or (fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST)
 
+    def _fallen(self, fit: Fit) -> bool:
+        """Whether so little of the scan has a counterpart that starts which agree may all be wrong."""
+        return bool(self.usual) and fit.overlap < FALLEN * float(np.median([overlap for overlap, _ in self.usual]))
+
+    def _convincing(self, fit: Fit) -> bool:
+        """Whether a pose that one start alone has found needs no other opinion."""
+        usual = float(np.median([total for _, total in self.usual])) if self.usual else np.inf
+        return fit.total < min(CONVINCING, STRIKING * usual)
+
     def _usual(self, fit: Fit) -> bool:
         """Whether the fit is as good as the last ones; a scanner's rings on the ground hold it where it was, too."""
         overlap, total = np.median(self.usual, axis=0)
@@ -190,16 +207,22 @@ class Odometry:
     def _polished(self, scan: PreparedScan, fit: Fit, expected: Expected) -> Fit:
         """The fit's exact pose; along directions that are not observed, the prediction's.
 
-        Two things can show that such a direction is observed after all: the scan does not fit there, or there all of
-        it is observed.
+        Three things can show that such a direction is observed after all: a pose further off fits and is observed in
+        all directions; the scan does not fit at the prediction; or there all of it is observed.
         """
         assert self.motion
         usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
-        fit, slope = self.map.polish(scan, fit, usual_slope)
+        found, (fit, slope) = fit, self.map.polish(scan, fit, usual_slope)
         if np.isfinite(slope):
             self.slopes.append(slope)
+        if fit.verified:  # by the scan before, whatever little the map has there
+            same = fit.seen is not None and displacement(fit.T_map_scan, found.T_map_scan, scan.points) < FINE
+            return replace(fit, seen=fit.seen.as_observed()) if fit.seen and same else replace(found, rms=fit.rms)
         if fit.seen is None or fit.seen.observed.all():
             return fit
+        elsewhere = self._observed_elsewhere(scan, fit, expected, usual_slope)
+        if elsewhere is not None:
+            return elsewhere
         held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, expected, fit.seen))
         there, _ = self.map.polish(scan, held, usual_slope)
         if there.seen is None:
@@ -209,6 +232,19 @@ class Odometry:
         if there.rms > WORSE * max(fit.rms, FINEST):
             return replace(fit, seen=fit.seen.as_observed())
         return replace(there, T_map_scan=self.motion.combined(there.T_map_scan, expected, there.seen))
+
+    def _observed_elsewhere(self, scan: PreparedScan, fit: Fit, expected: Expected, slope: float) -> Fit | None:
+        """A pose found from further off that fits about as well and leaves nothing open.
+
+        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing.
+        """
+        other = self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)
+        if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
+            return None
+        if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
+            return None
+        other, _ = self.map.polish(scan, other, slope)
+        return other if other.seen is not None and other.seen.observed.all() else None
 
     def _accept(self, index: int, scan: PreparedScan, expected: Expected, fit: Fit) -> None:
         """Take the fit as the pose, and the scan into the map where it has moved on or the map has grown stale."""
@@ -225,9 +261,7 @@ class Odometry:
             self.map.insert(index, scan, fit.T_map_scan)
             self.best_total = np.inf
 
-    def _bridge(
-        self, index: int, scan: PreparedScan | None, expected: Expected, fit: Fit, feature_errors: FeatureErrors
-    ) -> Frame:
+    def _bridge(self, index: int, scan: PreparedScan | None, expected: Expected, fit: Fit) -> Frame:
         """Go on at the prediction; where that lasts, with a new map, or elsewhere in the known one."""
         self.aligned, self.uncertain = 0, self.uncertain + 1
         assert self.motion
@@ -238,7 +272,7 @@ class Odometry:
             if self.uncertain >= LOST_AFTER:
                 self._begin_again(index, scan)
         T_first_scan = self.frame.pose_to_file(self.motion.T_map_scan)
-        return Frame(T_first_scan, "uncertain", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+        return Frame(T_first_scan, "uncertain", fit.overlap, fit.rms * self.frame.voxel, fit.start)
 
     def _begin_again(self, index: int, scan: PreparedScan) -> None:
         """The old map is out of sight: what follows is at least right in itself. A known map is looked for."""
@@ -253,11 +287,11 @@ class Odometry:
         self.motion.forget_place(T_map_scan)
         self.last = (index, scan, T_map_scan)
 
-    def _frame(self, scan: PreparedScan, fit: Fit, feature_errors: FeatureErrors) -> Frame:
+    def _frame(self, fit: Fit) -> Frame:
         """What came of a scan that fits."""
         assert self.motion
         T_first_scan = self.frame.pose_to_file(fit.T_map_scan)
-        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start)
         if fit.seen is None or fit.seen.observed.all():
             return found
         rotation, shift = self.motion.sigma(fit.seen.centre)
@@ -302,10 +336,3 @@ class Odometry:
         for index in state["map"]:
             self.map.insert(index, load(index), T_map_scan[index])
         self.last = (state["last"], load(state["last"]), T_map_scan[state["last"]])
-
-
-def levels(expected: float) -> tuple[float, ...]:
-    """The map's levels from which a pose is reached that the prediction misses by so many voxels, coarse to fine."""
-    if expected < FINE:
-        return (FINE,)
-    return (COARSE, FINE) if expected < COARSE * REACH else (WIDE, COARSE, FINE)

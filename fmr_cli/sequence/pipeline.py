@@ -62,12 +62,16 @@ def align_sequence(
     scans = as_scans(scans)
     known_cloud = read_cloud(known_map, attributes=False) if isinstance(known_map, Path) else known_map
     check(scans, options, out, resume, known_cloud)
+    strict = options.deskew is True  # else a later scan without times is taken as it is
+    options = replace(options, deskew=has_times(scans) if options.deskew is None else options.deskew)
     journal = Journal(out, settings(scans, options, init_poses or {}, known_cloud))
     beginning, done = (journal.read() if resume else None) or (begin(scans, options, known_cloud), [])
 
     rows: list[dict[str, Any]] = []
     poses: list[np.ndarray] = []  # T_first_scan of every frame so far; the loader deskews by the last two
-    loader = Loader(scans, beginning, poses, deskewed=options.deskew, keep_clouds=merged is not None)
+    loader = Loader(
+        scans, beginning, poses, deskewed=bool(options.deskew), strict=strict, keep_clouds=merged is not None
+    )
     known = KnownMap((known_cloud.points - beginning.frame.of_map) / beginning.frame.voxel) if known_cloud else None
     odometry, priors = Odometry(beginning.frame, known), Priors(scans, init_poses or {}, beginning.frame)
     go_on(done, rows, poses, loader, odometry)
@@ -112,6 +116,15 @@ def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool
         raise FmrError("resume needs a file of poses, and scans in files; leave it out")
 
 
+def has_times(scans: Scans) -> bool:
+    """Whether the first scan's points have times that differ; what is wrong with it is said by whoever needs it."""
+    try:
+        scan_times(scans.read(0, attributes=True))
+    except CloudFileError:
+        return False
+    return True
+
+
 def settings(
     scans: Scans, options: SequenceOptions, init_poses: Mapping[str, KnownPose], known_map: PointCloud | None
 ) -> dict[str, Any]:
@@ -130,14 +143,14 @@ def settings(
 def begin(scans: Scans, options: SequenceOptions, known_map: PointCloud | None) -> Beginning:
     """What follows from the first scan, and for deskewing from the first two. Raises CloudFileError."""
     try:
-        cloud = scans.read(0, attributes=options.deskew)
+        cloud = scans.read(0, attributes=bool(options.deskew))
     except CloudFileError as error:
         raise CloudFileError(f"{error}; or leave this first scan out with --start") from None
     if options.deskew:
         scan_times(cloud)  # says before anything is written that points have no times
     origin = np.median(cloud.points, axis=0)
     map_origin = np.median(known_map.points, axis=0) if known_map else origin
-    frame = VoxelFrame(options.voxel_size or choose_voxel(cloud.points), origin, map_origin)
+    frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size), origin, map_origin)
     return Beginning(frame, first_motion(scans, frame) if options.deskew else np.eye(4))
 
 

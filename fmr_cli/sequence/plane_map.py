@@ -61,7 +61,7 @@ class PlaneMap:
         T: np.ndarray,
         slope: float,
     ) -> tuple[np.ndarray, float, float, Matches | None]:
-        """The pose near T of points with unit normals (N, 3), seen at ranges (N,), whose normals are right where solid (N,).
+        """The pose near T of points with unit normals (N, 3), seen at ranges (N,); a normal is right where solid (N,).
 
         slope: how residuals grow with range in this sensor's scans, see ``trust``. Returns the pose, the RMS distance
         from the planes, this scan's own slope, and what was matched; T as it was, NaN and None where too few points lie

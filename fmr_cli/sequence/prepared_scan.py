@@ -26,7 +26,11 @@ MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that th
 LINE = 0.1
 SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from which more neighbours are asked
 TILT = 3.0  # times the scan's median error, at which a normal is half trusted
+FEW = 512  # points that a scan's global feature is made of: enough to tell poses apart, 2 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
+# Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
+# no surface, and on coarser ones a scan slides.
+HINT = 1.25
 STEPS = 6  # of the search for the voxel, at most; each brings the count within a few percent
 COUNT_TOLERANCE = 0.1  # share by which the count may miss WORKING_POINTS
 # The count goes with the edge to the power of -1.5 to -2 (the rings of a LiDAR, a surface): -1 / 0.6 lies in between.
@@ -76,6 +80,25 @@ class PreparedScan:
         return 1 / (1 + (tilt2 / (TILT**2 * np.median(tilt2))) ** 2)
 
     @cached_property
+    def few(self) -> np.ndarray:
+        """(M, 3): FEW of the points, or all where there are fewer."""
+        return self.points[np.sort(np.random.default_rng(0).permutation(len(self.points))[:FEW])]
+
+    @cached_property
+    def box(self) -> tuple[np.ndarray, float]:
+        """Centre (3,) of the few points, and the radius about it that holds them all, voxels."""
+        centre = self.few.mean(0)
+        return centre, float(np.linalg.norm(self.few - centre, axis=1).max())
+
+    @cached_property
+    def feature(self) -> np.ndarray:
+        """(d,), the global feature of the few points in their box."""
+        from fmr_cli.registration.models import fast_encoder
+
+        centre, unit = self.box
+        return fast_encoder()(((self.few - centre) / unit).astype(np.float32))
+
+    @cached_property
     def for_align(self) -> Prepared:
         """The scan as feature-metric registration takes it, which encodes it once."""
         from fmr_cli.registration.pipeline import prepare
@@ -105,10 +128,11 @@ def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
     return scan if len(scan) >= MIN_POINTS else None
 
 
-def choose_voxel(points: np.ndarray) -> float:
+def choose_voxel(points: np.ndarray, wish: float | None = None) -> float:
     """The voxel edge that thins points (N, 3) to WORKING_POINTS, or to a quarter of them where they are few.
 
-    In the points' unit, to two digits. Raises RegistrationError where all points are in one place.
+    In the points' unit, to two digits. wish: an edge to be near to, within HINT. Raises RegistrationError where all
+    points are in one place.
     """
     wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
@@ -120,4 +144,6 @@ def choose_voxel(points: np.ndarray) -> float:
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
+    if wish is not None:
+        return float(np.clip(wish, voxel / HINT, voxel * HINT))
     return float(f"{voxel:.2g}")

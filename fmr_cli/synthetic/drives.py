@@ -148,10 +148,10 @@ def round_corners(
     """Corners of a way round a rectangle, ``every`` so far, each off it by up to ``stray``."""
     (a, b), corners = size, []
     for start, end in (((-a, -b), (a, -b)), ((a, -b), (a, b)), ((a, b), (-a, b)), ((-a, b), (-a, -b))):
-        start, end = np.array(start) / 2, np.array(end) / 2
-        count = max(int(np.linalg.norm(end - start) / every), 2)
+        low, high = np.array(start) / 2, np.array(end) / 2
+        count = max(int(np.linalg.norm(high - low) / every), 2)
         for step in (np.arange(count) + 0.5) / count:
-            corners.append([*(start + step * (end - start) + rng.uniform(-stray, stray, 2)), z])
+            corners.append([*(low + step * (high - low) + rng.uniform(-stray, stray, 2)), z])
     return np.array(corners)
 
 

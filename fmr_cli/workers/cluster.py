@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import logging
 import platform
+import signal
 import socket
 import sys
+import threading
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import fmr_cli
@@ -25,6 +27,7 @@ from fmr_cli.errors import FmrError
 from fmr_cli.workers.base import Answer, LostError, Task, forget
 
 CONNECT = 10.0  # s that a scheduler has to answer, and to come back after the connection was lost
+UNHEARD = 60.0  # s of silence of a scheduler whose connection holds: it is busy, or stopped
 NO_WORKERS = 60.0  # s to wait for a first worker, or for another one when all are gone
 LOOK = 2.0  # s between two looks at which workers there are
 LIBRARIES = ("numpy", "scipy", "small_gicp")  # whose versions may change the last bits of a result
@@ -42,7 +45,8 @@ class DaskWorkers:
     """The workers of a scheduler, as a context: it connects, and leaves what others run there alone.
 
     address: of a scheduler, such as tcp://host:8786, or tls://host:8786 with certificates in Dask's configuration;
-    "local" starts a scheduler here with ``count`` worker processes (None: one a core); or a ``distributed.Client``,
+    "local" starts a scheduler here with ``count`` worker processes (None: one a core), in a script to be called under
+    ``if __name__ == "__main__"``, since Dask runs scripts again in its workers; or a ``distributed.Client``,
     which stays open. say: is told the dashboard's address, and what is odd about a worker.
 
     Raises FmrError where Dask is not installed, nobody answers, or no worker can be used.
@@ -79,16 +83,21 @@ class DaskWorkers:
         if isinstance(self.address, distributed.Client):
             self.client = self.address
         elif self.address == "local":
-            self.cluster = distributed.LocalCluster(
-                n_workers=self.wanted or usable_cores(), threads_per_worker=1, dashboard_address="127.0.0.1:0",
-            )  # fmt: skip
+            with deaf_to_interrupts():  # Ctrl-C ends this process, which ends the workers
+                self.cluster = distributed.LocalCluster(
+                    n_workers=self.wanted or usable_cores(), threads_per_worker=1,
+                    dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
+                )  # fmt: skip
             self.client = distributed.Client(self.cluster, timeout=CONNECT, set_as_default=False)
         else:
             check_address(self.address)
             try:
                 self.client = distributed.Client(self.address, timeout=CONNECT, set_as_default=False)
             except (OSError, ValueError, RuntimeError) as error:
-                raise FmrError(f"--dask {self.address}: no Dask scheduler answers there ({reason(error)})") from None
+                raise FmrError(
+                    f"--dask {self.address}: no Dask scheduler answers there ({reason(error)[:80]}); "
+                    "give another address, or tls:// where it wants TLS"
+                ) from None
         try:
             if self.client.dashboard_link:
                 self.say(f"dashboard: {self.client.dashboard_link}")
@@ -116,6 +125,8 @@ class DaskWorkers:
 
     def look_at_workers(self) -> set[str]:
         """Asks the scheduler which workers there are, at most every LOOK seconds, and new ones what they have."""
+        if self.client.status == "closed":
+            raise self.lost()
         now = time.monotonic()
         if now - self.looked >= LOOK or not self.fit:
             there = self.ask_scheduler(lambda: self.client.nthreads(callback_timeout=CONNECT))
@@ -176,19 +187,23 @@ class DaskWorkers:
         self.say(f"worker {address} is left out: it {why}")
 
     def ask_scheduler(self, question: Callable[[], Any]) -> Any:
-        """What the scheduler says, or None where it does not; after CONNECT seconds of silence a FmrError."""
+        """What the scheduler says, or None where it does not; a FmrError after UNHEARD s, or once the client is closed.
+
+        A client whose connection is lost closes itself after CONNECT seconds of trying again.
+        """
         try:
             answer = question()
         except (OSError, TimeoutError, CancelledError, RuntimeError, AttributeError):  # the last two: while it closes
             self.unheard = self.unheard or time.monotonic()
-            if self.client.status == "closed" or time.monotonic() - self.unheard > CONNECT:
-                raise FmrError(
-                    f"--dask {self.name}: lost the connection to the scheduler; what is written stays"
-                ) from None
+            if self.client.status == "closed" or time.monotonic() - self.unheard > UNHEARD:
+                raise self.lost() from None
             time.sleep(0.2)
             return None
         self.unheard = None
         return answer
+
+    def lost(self) -> FmrError:
+        return FmrError(f"--dask {self.name}: lost the connection to the scheduler; what is written stays")
 
     # The work.
 
@@ -206,9 +221,15 @@ class DaskWorkers:
 
     def submit(self, function: Callable, argument: Any, to: set[str]) -> Any:
         """A future of function(argument) on one of these workers."""
-        return self.client.submit(
-            function, argument, key=f"fmr-{uuid.uuid4().hex}", pure=False, workers=sorted(to), allow_other_workers=False
-        )
+        key = f"fmr-{uuid.uuid4().hex}"
+        try:
+            return self.client.submit(
+                function, argument, key=key, pure=False, workers=sorted(to), allow_other_workers=False
+            )
+        except Exception:
+            if self.client.status == "closed":
+                raise self.lost() from None
+            raise
 
     def responsive(self) -> set[str]:
         """The workers that can be used and aren't silent; where all are, all."""
@@ -224,6 +245,19 @@ class DaskWorkers:
         with suppress(Exception):
             if futures:
                 self.client.cancel(futures, force=True)
+
+
+@contextmanager
+def deaf_to_interrupts() -> Iterator[None]:
+    """Processes that are started within do not hear Ctrl-C, which goes to all that share a terminal."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def what_is_here() -> dict[str, str]:

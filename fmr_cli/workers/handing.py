@@ -165,6 +165,7 @@ class Handing:
             if isinstance(back.error, UnfitError):
                 if back.worker in self.workers.fit:
                     self.workers.refuse(back.worker, f"cannot do it: {back.error}")
+                handed.alone = False
                 return
             if back.error is not None:
                 raise back.error

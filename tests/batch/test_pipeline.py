@@ -82,6 +82,7 @@ def test_pairs_that_share_files_go_to_one_worker_and_spent_files_are_let_go_of(t
     blocks = [*pipeline.in_blocks(runner, pairs, most=2)]
     assert ["".join(p.source + p.target for p in block.pairs) for block in blocks] == ["abbc", "cd", "xyya", "ac"]
     assert ["".join(sorted(path.name for path in block.spent)) for block in blocks] == ["b", "d", "xy", "ac"]
+    assert [len(block.pairs) for block in pipeline.in_blocks(runner, pairs, most=4, sharing=False)] == [4, 2]
 
 
 def test_the_metrics_of_each_pair_are_those_of_align(manifest, tmp_path):

@@ -103,8 +103,11 @@ def test_a_data_set_is_told_by_its_files(tmp_path, fmr_here, pairs_csv):
 
 def test_what_is_quoted_is_marked(tmp_path, fmr_here):
     layouts.write_eth(tmp_path / "eth")
-    done = fmr_here("evaluate", "eth", "--pairs", "1", "--no-plain", "--no-align", "-o", "out", cwd=tmp_path)
+    pytest.importorskip("jinja2")
+    few = ("--pairs", "1", "--no-plain", "--no-align")
+    done = fmr_here("evaluate", "eth", *few, "-o", "out", "--report", "r.html", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "quoted: latex_tables/ETH_results.tex" in (tmp_path / "r.html").read_text("utf-8")
     with (tmp_path / "out/results.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["method"] for row in rows if row["measured"] == "yes"] == ["solver alone"]

@@ -105,17 +105,36 @@ def anchored(graph, values, gtsam):
     return graph
 
 
-def test_a_kill_loses_no_link_and_resume_gives_the_same(fmr, folder):
+def started(folder, *extra, **given):
+    """A run as a process of its own, with one worker, that hears Ctrl-C."""
+    command = [sys.executable, "-m", "fmr_cli.cli", "multiway", "scans", "--out", "out", "--workers", "1", *extra]
+    unmasked = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **given}
+    return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True, **unmasked)
+
+
+def wait_for_lines(process, journal, count):
+    while process.poll() is None and not (journal.exists() and journal.read_text().count("\n") >= count):
+        time.sleep(0.01)
+
+
+def test_ctrl_c_and_a_kill_lose_no_link_and_resume_gives_the_same(fmr, folder):
     assert fmr("multiway", "scans", "--out", "whole", "-q", cwd=folder).returncode == 0
     journal = folder / "out" / "journal.jsonl"
-    command = [sys.executable, "-m", "fmr_cli.cli", "multiway", "scans", "--out", "out", "--workers", "1"]
-    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.DEVNULL)
-    while process.poll() is None and not (journal.exists() and journal.read_text().count("\n") >= 3):
-        time.sleep(0.01)
+    process = started(folder)
+    wait_for_lines(process, journal, 2)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate()[1]
+    assert process.returncode == 130
+    assert said.splitlines() == ["stopped; what is done is kept in out, --resume goes on"]
+    stopped = journal.read_text().splitlines()
+    assert len(stopped) >= 2
+    process = started(folder, "--resume")
+    wait_for_lines(process, journal, len(stopped) + 1)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     kept = journal.read_text().splitlines()
-    assert len(kept) >= 3
+    assert len(kept) > len(stopped)
+    assert kept[: len(stopped)] == stopped
     assert not (folder / "out" / "scans.csv").exists()
     refused = fmr("multiway", "scans", "--out", "out", cwd=folder)
     assert refused.returncode == 2
@@ -124,6 +143,28 @@ def test_a_kill_loses_no_link_and_resume_gives_the_same(fmr, folder):
     assert journal.read_text().splitlines()[: len(kept)] == kept, "what was done is not done again"
     assert result(folder / "out") == result(folder / "whole")
     assert not (folder / "out" / "work").exists()
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(fmr, folder):
+    import resource
+
+    def limited(size):
+        """No file may grow beyond so many bytes, as on a disk that is full."""
+        return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+    journal = folder / "out" / "journal.jsonl"
+    for size, file, extra in ((6_000, "journal.jsonl", ()), (100_000, "all.ply", ("--merged", "all.ply", "--resume"))):
+        process = started(folder, *extra, preexec_fn=limited(size))
+        said = process.communicate()[1]
+        assert process.returncode == 2, said
+        assert len(said.splitlines()) == 1
+        assert f"{file}: cannot be written" in said
+        assert not (folder / "all.ply").exists()
+        kept = journal.read_bytes()
+        kept = kept[: kept.rfind(b"\n") + 1]
+        assert kept.count(b"\n") >= 2
+    assert fmr("multiway", "scans", "--out", "out", "--resume", "-q", cwd=folder).returncode == 0
+    assert journal.read_bytes().startswith(kept)
 
 
 def test_resume_refuses_other_settings(fmr, folder):

@@ -190,7 +190,7 @@ def test_a_truth_of_another_length_is_one_line(fmr_here, street, tmp_path):
 def test_deskew_undoes_the_motion_within_the_scans(fmr_here, moving, tmp_path):
     folder, truth = moving
     end_errors = []
-    for options in ([], ["--deskew"]):
+    for options in (["--no-deskew"], []):
         done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", *options)
         assert done.returncode == 0, done.stderr
         error = np.linalg.inv(read_poses(tmp_path / "p.txt")) @ truth

@@ -93,3 +93,22 @@ def test_pairs_that_would_overlap_and_do_not_fit_deny_a_join():
     found, apart = components(4, [*base, silent], overlap=0.9)
     assert members(found) == [[0, 1], [2, 3]]
     assert apart[0, 1].denied == 1
+
+
+def test_what_views_contradict_is_not_joined_but_for_a_link_that_is_given():
+    links = [link(1, 0, 0.99), link(3, 2, 0.99), link(2, 0, 0.9)]
+
+    def blocked(pairs):
+        """Scans 0 and 1 see through 2 and 3."""
+        return 0.1 if any((i < 2) != (j < 2) for i, j, _ in pairs) else 0.0
+
+    moments = dict.fromkeys(range(4), np.diag([9.0, 9.0, 9.0, 1.0]))
+    for x in links:  # views tell, since each scan's best link is in line with them
+        x.hypotheses[0].seen_through = 0.0
+    far = {"seen_through": lambda pairs: 0.0}
+    assert members(joined(4, links, moments, lambda i, j, T: 0.0, **far)[0]) == [[0, 1, 2, 3]]
+    found, apart = joined(4, links, moments, lambda i, j, T: 0.0, seen_through=blocked)
+    assert members(found) == [[0, 1], [2, 3]]
+    assert apart[0, 1].denied > 0
+    links[2].start = "known"
+    assert members(joined(4, links, moments, lambda i, j, T: 0.0, seen_through=blocked)[0]) == [[0, 1, 2, 3]]

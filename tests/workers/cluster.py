@@ -21,7 +21,7 @@ class Cluster:
         self.folder, self.processes = folder, []
         self.scheduler = self.start("from distributed.cli.dask_scheduler import main", "--port", 0, "--scheduler-file",
                                     folder / "scheduler.json", "--no-dashboard", "--host", "127.0.0.1")  # fmt: skip
-        wait_for((folder / "scheduler.json").exists)
+        wait_for(lambda: (folder / "scheduler.json").exists() and (folder / "scheduler.json").read_text().endswith("}"))
         self.address = json.loads((folder / "scheduler.json").read_text())["address"]
 
     def worker(self, first: str = "", prefix: tuple[str, ...] = ()) -> subprocess.Popen:
@@ -51,7 +51,7 @@ class Cluster:
             process.wait()
 
 
-def wait_for(condition, seconds: float = 30.0) -> None:
+def wait_for(condition, seconds: float = 120.0) -> None:
     """Until a condition holds; an AssertionError after so long."""
     end = time.monotonic() + seconds
     while not condition():

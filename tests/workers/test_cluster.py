@@ -24,6 +24,7 @@ from workers.cluster import Cluster, stop, wait_for  # noqa: E402
 import fmr_cli  # noqa: E402
 from fmr_cli import read_cloud, write_cloud  # noqa: E402
 from fmr_cli.batch import align_batch  # noqa: E402
+from fmr_cli.cli.app import main  # noqa: E402
 from fmr_cli.errors import FmrError  # noqa: E402
 from fmr_cli.multiway import align_many  # noqa: E402
 from fmr_cli.workers import DaskWorkers, cluster, handing  # noqa: E402
@@ -41,7 +42,7 @@ def shared(tmp_path_factory):
         for first in ("", "", WRONG_VERSION):
             found.worker(first)
         with distributed.Client(found.address, set_as_default=False) as client:
-            client.wait_for_workers(3, timeout=60)
+            client.wait_for_workers(3, timeout=120)
         yield found
 
 
@@ -51,7 +52,7 @@ def impatient(monkeypatch):
     monkeypatch.setattr(handing, "SLOWER", 1.5)
     monkeypatch.setattr(handing, "TICK", 0.1)
     monkeypatch.setattr(cluster, "LOOK", 0.2)
-    monkeypatch.setattr(cluster, "CONNECT", 5.0)
+    monkeypatch.setattr(cluster, "CONNECT", 10.0)
 
 
 def have(workers: DaskWorkers, count: int) -> None:
@@ -86,7 +87,7 @@ def test_closing_gives_up_what_is_under_way(shared):
         answers = workers.run(work.slow, range(50))
         next(answers)
         answers.close()
-        wait_for(lambda: not any(workers.client.processing().values()), 10)
+        wait_for(lambda: not any(workers.client.processing().values()))
 
 
 def test_a_client_that_is_given_stays_open(shared):
@@ -121,12 +122,17 @@ def table(out: Path) -> list[dict[str, str]]:
 
 
 def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
-    """Of four workers one is killed and one stopped; the run is cut off, and gone on with by processes."""
+    """Of four workers one is killed and one stopped; the run is cut off, and gone on with by processes.
+
+    All pairs start from the truth, which is quick.
+    """
     for name in "ab":
         cloud = read_cloud(SAMPLES / f"scan_{name}.ply")
         write_cloud(tmp_path / f"{name}.ply", cloud.select(slice(None, None, 8)))
     manifest = tmp_path / "pairs.csv"
-    manifest.write_text("source,target\n" + 4 * "a.ply,b.ply\n" + "a.ply,nowhere.ply\n" + 4 * "b.ply,a.ply\n")
+    shutil.copy(SAMPLES / "truth.txt", tmp_path)
+    manifest.write_text("source,target,init\n" + 5 * "a.ply,b.ply,truth.txt\n" + "a.ply,nowhere.ply,\n"
+                        + 3 * "a.ply,b.ply,truth.txt\n")  # fmt: skip
     killed, stopped = shared.worker(), shared.worker()
 
     def harm(row, done, total):
@@ -154,9 +160,9 @@ def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(share
 
 def test_a_network_is_the_same(shared, tmp_path):
     """Three scans, of which one is a moved copy of the first one's other points."""
-    a, b = (read_cloud(SAMPLES / f"scan_{name}.ply").select(slice(None, None, 6)) for name in "ab")
+    a, b = (read_cloud(SAMPLES / f"scan_{name}.ply").select(slice(None, None, 10)) for name in "ab")
     T = np.array([[0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1.0]])
-    c = read_cloud(SAMPLES / "scan_a.ply").select(slice(3, None, 6)).transformed(T)
+    c = read_cloud(SAMPLES / "scan_a.ply").select(slice(3, None, 10)).transformed(T)
     for name, cloud in zip("abc", (a, b, c), strict=True):
         write_cloud(tmp_path / f"{name}.ply", cloud)
     scans = [tmp_path / f"{name}.ply" for name in "abc"]
@@ -166,21 +172,20 @@ def test_a_network_is_the_same(shared, tmp_path):
     here = align_many(scans, workers=2)
     assert len(here.links) == 3
     assert np.array_equal([s.T_component_scan for s in here.scans], [s.T_component_scan for s in there.scans])
-    assert [vars(link)["confidence"] for link in here.links] == [vars(link)["confidence"] for link in there.links]
+    assert [link.confidence for link in here.links] == [link.confidence for link in there.links]
 
 
-def test_evaluate_is_the_same(shared):
-    """The command itself, by two workers and by none."""
+def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path, monkeypatch, capsys):
     found = []
-    command = [sys.executable, "-m", "fmr_cli.cli", "evaluate", SAMPLES, "--no-align", "--experiments", "noise"]
+    experiment = ["--no-align", "--experiments", "noise", "--pairs", "2", "--points", "64"]
     for more in (["--dask", shared.address], []):
-        out = shared.folder / f"evaluation{len(more)}"
-        done = subprocess.run(
-            [*command, "-o", out, "--pairs", "2", "--points", "64", *more], capture_output=True, text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=240,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        assert ("dashboard: http" in done.stderr) == bool(more)
+        out = tmp_path / f"evaluation{len(more)}"
+        monkeypatch.setattr(sys, "argv", ["fmr", "evaluate", str(SAMPLES), "-o", str(out), *experiment, *more])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr().err
+        assert end.value.code == 0, said
+        assert ("dashboard: http" in said) == bool(more)
         with (out / "results.csv").open(newline="") as file:
             found.append([{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)])
     assert len(found[0]) == 10
@@ -201,7 +206,7 @@ def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monke
         monkeypatch.setattr(cluster, "NO_WORKERS", 0.5)
         with pytest.raises(FmrError, match="it has no workers"), DaskWorkers(alone.address):
             pass
-        monkeypatch.setattr(cluster, "NO_WORKERS", 30)
+        monkeypatch.setattr(cluster, "NO_WORKERS", 120)
         without = alone.worker(WITHOUT_FMR)
         with (
             pytest.raises(FmrError, match=r"none of 1 workers can be used; .* lacks fmr_cli"),
@@ -217,7 +222,7 @@ def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monke
             begin = time.monotonic()
             with pytest.raises(FmrError, match="lost the connection"):
                 list(answers)
-            assert time.monotonic() - begin < 4 * cluster.CONNECT
+            assert time.monotonic() - begin < 10 * cluster.CONNECT
 
 
 @pytest.mark.parametrize(

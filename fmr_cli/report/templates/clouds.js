@@ -2,7 +2,7 @@
 // Clouds in three dimensions and a section through them. A page says which clouds: shownClouds() gives
 // [{name, points: Float32Array of xyz, values: per-point numbers from 0 to 65535 or null, colour: CSS colour}].
 const AXES = ["x", "y", "z"], SECTION_POINTS = 4000; // of each cloud in a section: an SVG stays quick
-const scale = [[0, "#0d3b8c"], [0.25, "#2a8fbd"], [0.5, "#8fc77a"], [0.75, "#f2c14e"], [1, "#c8321f"]]; // few to many
+const scale = [[0, "#245cbe"], [0.25, "#2a8fbd"], [0.5, "#8fc77a"], [0.75, "#f2c14e"], [1, "#c8321f"]]; // few to many
 function moved(points, T) {
   const out = new Float32Array(points.length);
   for (let i = 0; i < points.length; i += 3) {
@@ -20,9 +20,9 @@ function marker(cloud, size, keep = null, bar = false) {
   if (cloud.own) return { size, color: keep ? keep.map((i) => cloud.own[i]) : cloud.own, line: { width: 0 } };
   if (!cloud.values) return { size, color: cloud.colour, opacity: 1, line: { width: 0 } };
   const values = keep ? keep.map((i) => cloud.values[i]) : Array.from(cloud.values);
-  const ends = cloud.ends; // the values that 0 and 65535 stand for, and their name
-  return { size, color: values, cmin: 0, cmax: 65535, colorscale: scale, line: { width: 0 }, showscale: bar && !!ends,
-    colorbar: ends && { title: { text: ends.name, side: "right" }, thickness: 12, len: 0.7, tickvals: [0, 32767, 65535],
+  const ends = cloud.ends, top = (ends && ends.top) || 65535; // the values that 0 and ``top`` stand for, and their name
+  return { size, color: values, cmin: 0, cmax: top, colorscale: scale, line: { width: 0 }, showscale: bar && !!ends,
+    colorbar: ends && { title: { text: ends.name, side: "right" }, thickness: 12, len: 0.7, tickvals: [0, top / 2, top],
       ticktext: [said(ends.low), said((ends.low + ends.high) / 2), (ends.open ? "≥ " : "") + said(ends.high)] } };
 }
 function scenePlot() {

@@ -2,11 +2,12 @@
 // Lines with their names at their ends, and 95 % intervals where there are some.
 const HUES = ["series1", "series2", "series3", "series4", "series5", "series6"], SIGNS = ["circle", "square", "triangle-up", "diamond", "triangle-down", "cross"], DASHES = ["solid", "dash", "dot", "dashdot"];
 function curvePlot(spec) {
-  const layout = axes(baseLayout(), { title: { text: spec.x } }, { title: { text: spec.y }, type: spec.log ? "log" : "linear" });
+  const layout = axes(baseLayout(), { title: { text: spec.x }, type: spec.xlog ? "log" : "linear" }, { title: { text: spec.y }, type: spec.log ? "log" : "linear" });
   if (spec.range) layout.yaxis.range = spec.range;
   layout.margin.r = 20 + 7 * Math.min(26, Math.max(0, ...spec.series.map((s) => s.name.length)));
-  const data = spec.series.map((s, n) => ({ type: "scatter", mode: "lines+markers", name: literal(s.name), x: s.at, y: s.values,
-    line: { color: colour(HUES[n % HUES.length]), dash: DASHES[n % DASHES.length], width: 2 }, marker: { symbol: SIGNS[n % SIGNS.length], size: 7 },
+  const data = spec.series.map((s, n) => ({ type: "scatter", mode: spec.steps ? "lines" : "lines+markers", name: literal(s.name), x: s.at, y: s.values,
+    line: { color: colour(HUES[n % HUES.length]), dash: DASHES[n % DASHES.length], width: 2, shape: spec.steps ? "hv" : "linear" },
+    marker: { symbol: SIGNS[n % SIGNS.length], size: 7 },
     error_y: s.high ? { type: "data", symmetric: false, array: s.high.map((v, i) => v - s.values[i]), arrayminus: s.low.map((v, i) => s.values[i] - v), thickness: 1, width: 2 } : undefined,
     hovertemplate: `%{x}: %{y:.4g}<extra>${literal(s.name).replace(/%/g, "&#37;")}</extra>` }));
   // Names at the ends, moved apart where they would meet.

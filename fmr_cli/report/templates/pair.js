@@ -5,14 +5,17 @@ page.poses.forEach((pose) => { pose.point = shares(pose.point); pose.plane = sha
 const chosen = () => Number(document.querySelector("input[name=pose]:checked").value);
 const placed = page.poses.map(() => null); // the source at each pose, made when it is first shown
 
+// The error up to which errors are told apart: by the scans' own spacing or noise, what is beyond is far off.
+const worthTelling = (by) => Math.min(page.limit, Math.max(4 * (by === "plane" ? page.noise : page.spacing), page.voxel / 4));
+
 function shownClouds() {
   const n = chosen(), pose = page.poses[n], by = byId("colouring").value;
   placed[n] ??= moved(page.clouds[1].xyz, pose.matrix);
   const values = by === "file" ? null : pose[by];
-  const name = by === "plane" ? "plane error" : "point error";
+  const name = by === "plane" ? "plane error" : "point error", high = worthTelling(by);
   return [
     { name: "target", points: page.clouds[0].xyz, values: null, colour: values ? colour("line") : colour("target") },
-    { name: "source", points: placed[n], values, colour: colour("source"), ends: { name, low: 0, high: page.limit, open: true } },
+    { name: "source", points: placed[n], values, colour: colour("source"), ends: { name, low: 0, high, open: true, top: 65535 * high / page.limit } },
   ];
 }
 function sceneExtras() { // the directions that are not determined: an arrow each way to shift, a dashed axis to turn about
@@ -35,7 +38,7 @@ function across([x, y, z]) { // a unit vector at right angles
 const BINS = 60;
 function histogramPlot() {
   const by = byId("error").value, pose = page.poses[chosen()];
-  const high = Math.min(page.limit, Math.max(4 * page.spacing, 4 * page.noise, page.voxel / 4)), step = high / BINS;
+  const high = worthTelling(by), step = high / BINS;
   const count = new Float64Array(BINS);
   let beyond = 0;
   for (const share of pose[by]) {

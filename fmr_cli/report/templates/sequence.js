@@ -33,9 +33,9 @@ function curvesPlot() {
     const axis = n ? `y${n + 1}` : "y", key = n ? `yaxis${n + 1}` : "yaxis", top = 1 - n * 0.345;
     layout[key] = { ...baseLayout().yaxis, title: { text: title }, domain: [top - 0.3, top], rangemode: "tozero" };
     const values = rows.map((r) => r[name]);
-    data.push({ type: "scatter", mode: "lines+markers", x: rows.map((r) => r.frame), y: values, yaxis: axis, connectgaps: false, line: { color: colour("target"), width: 1.5 },
-      marker: { size: rows.map((_, i) => (sure[i] ? 4 : 8)), symbol: rows.map((_, i) => (sure[i] ? "circle" : "triangle-up")), color: rows.map((_, i) => colour(sure[i] ? "target" : "doubtful")) },
-      text: rows.map((r) => literal(`${r.file}: ${r.status}`)), hovertemplate: "frame %{x}: %{y:.4g}<br>%{text}<extra></extra>" });
+    const shared = { type: "scatter", x: rows.map((r) => r.frame), yaxis: axis, text: rows.map((r) => literal(`${r.file}: ${r.status}`)), hovertemplate: "frame %{x}: %{y:.4g}<br>%{text}<extra></extra>" };
+    data.push({ ...shared, mode: "lines+markers", y: values, connectgaps: false, line: { color: colour("target"), width: 1.5 }, marker: { size: 4, color: colour("target") } });
+    data.push({ ...shared, mode: "markers", y: values.map((v, i) => (sure[i] ? null : v)), marker: { size: 10, symbol: "triangle-up", color: colour("doubtful"), line: { color: colour("ground"), width: 1 } } });
   });
   layout.shapes = [{ type: "line", xref: "x", yref: "paper", x0: rows[frameNow()].frame, x1: rows[frameNow()].frame, y0: 0, y1: 1, line: { color: colour("text"), width: 1, dash: "dot" } }];
   return { data, layout };
