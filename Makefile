@@ -29,7 +29,7 @@ coverage: .venv/installed-for-tests
 
 # Every extra: no test is skipped for want of a package.
 .venv/installed-for-tests: .venv/installed
-	$(INSTALL) '.[eval,e57,baselines,dev]'
+	$(INSTALL) '.[eval,report,e57,ros,crs,baselines,dask,dev]'
 	touch $@
 
 clean:

@@ -29,6 +29,7 @@ from benchmarks.common import (
     ways,
 )
 from fmr_cli.geometry.pose_error import pose_error
+from fmr_cli.report import plots
 
 DEGREES, SHIFT = 5.0, 0.1  # of a pose that counts as found
 
@@ -57,16 +58,19 @@ def measure(clouds: list[np.ndarray], protocol: str, methods: dict, pairs: int, 
 
 
 def plot(figure: Any, rows: list[dict[str, Any]]) -> None:
-    """A panel for each set of clouds: recall by protocol, a line for each method."""
-    sets = list(dict.fromkeys(row["clouds"] for row in rows))
-    for axis, name in zip(figure.subplots(1, len(sets), squeeze=False)[0], sets, strict=True):
-        for place, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
+    """A panel for each set of clouds: recall by protocol with its 95 % binomial interval, a dot for each method."""
+    sets, methods, protocols = (list(dict.fromkeys(row[k] for row in rows)) for k in ("clouds", "method", "protocol"))
+    panels = figure.subplots(1, len(sets), squeeze=False, sharey=True)[0]
+    for panel, name in zip(panels, sets, strict=True):
+        series = []
+        for method in methods:
             own = [row for row in rows if (row["clouds"], row["method"]) == (name, method)]
-            recall = [row["recall"] for row in own]
-            axis.plot([row["protocol"] for row in own], recall, "o-", label=method, zorder=9 - place)  # fmr in front
-        axis.set(title=name, ylim=(-0.03, 1.03), ylabel=f"recall ({DEGREES:g} deg, {SHIFT:g})")
-        axis.tick_params(axis="x", rotation=40)
-    axis.legend(fontsize="small", loc="lower left")
+            low, high = zip(*(plots.binomial(row["recall"], row["pairs"]) for row in own), strict=True)
+            at = [protocols.index(row["protocol"]) for row in own]
+            series.append(plots.Series(method, at, [row["recall"] for row in own], low, high))
+        plots.dots(panel, protocols, series)
+        panel.set(title=name, xlim=(0, 1.02), xlabel=f"recall ({DEGREES:g} deg, {SHIFT:g}), 95 % interval")
+    plots.names_above(figure, methods)
 
 
 def main() -> None:

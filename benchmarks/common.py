@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.cores import usable_cores
-from fmr_cli.evaluation.baselines import Baseline, gicp, global_baselines
+from fmr_cli.evaluation.baselines import Baseline, gicp, global_baselines, then_gicp
 from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import align
+from fmr_cli.report import plots
 from fmr_cli.synthetic import scenes
 from fmr_cli.synthetic.shapes import shapes
 
@@ -90,19 +91,17 @@ def make_pair(protocol: str, points: np.ndarray, rng: np.random.Generator) -> tu
 
 def ways(voxel: float, reach: float) -> dict[str, Baseline]:
     """fmr and the peers that are installed, each end to end; voxel edge and GICP's reach are the peers'."""
-    refine = partial(gicp, voxel=voxel, reach=reach, threads=CORES)
-
-    def refined(start: Baseline, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return refine(source, target, start=start(source, target))
-
     found: dict[str, Baseline] = {
         "fmr": lambda source, target: align(PointCloud(source), PointCloud(target), Options(), CORES).T_target_source
     }
     peers, missing = global_baselines(voxel)
     for line in missing:
         console.print(line)
-    found |= {f"{name} + small_gicp": partial(refined, start) for name, start in peers.items()}
-    found["small_gicp from the identity"] = refine
+    found |= {
+        f"{name} + small_gicp": then_gicp(start, lambda source, target: voxel, reach / voxel, CORES)
+        for name, start in peers.items()
+    }
+    found["small_gicp from the identity"] = partial(gicp, voxel=voxel, reach=reach, threads=CORES)
     return found
 
 
@@ -130,16 +129,13 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
     console.print(table)
 
 
-def save(out: Path | None, report: dict[str, Any], draw: Callable[[Any], None]) -> None:
-    """OUT.json with the report, and OUT.png where matplotlib is installed; draw(figure)."""
+def save(out: Path | None, report: dict[str, Any], draw: Callable[[Any], None], height: float = 3.4) -> None:
+    """OUT.json with the report, and OUT.png where matplotlib is installed; draw(figure), so many inches high."""
     if out is None:
         return
     out.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        console.print(f"plot: skipped ({error})")
+    if not plots.can_plot():
+        console.print("plot: skipped (matplotlib is not installed)")
         return
-    figure = Figure((13, 4.6), layout="constrained")
-    draw(figure)
-    figure.savefig(out.with_suffix(".png"), dpi=120)
+    with plots.figure(out.with_suffix(".png"), plots.PAGE, height) as figure:
+        draw(figure)

@@ -46,6 +46,7 @@ from fmr_cli.io import write_cloud
 from fmr_cli.registration.models import bundled_encoder, fast_encoder
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import align
+from fmr_cli.report import plots
 
 Row = dict[str, Any]
 Rows = list[Row]
@@ -288,23 +289,39 @@ PARTS: dict[str, Callable[[Setup], Rows]] = {
 
 def plot(figure: Any, report: dict[str, Rows]) -> None:
     """A panel each, where measured: IC alone, the whole registration, its growth with the number of points."""
-    bars = {part: report[part] for part in ("ic", "align") if part in report}
-    axes = list(figure.subplots(1, max(len(bars) + ("growth" in report), 1), squeeze=False)[0])
-    for part, rows in bars.items():
-        axis = axes.pop(0)
-        shown = [r for r in rows if not r["what"].startswith("stage")]
-        names = [r["what"].replace(": ", "\n") for r in shown]
-        axis.barh(names, [r["s"] for r in shown], color=["C3" if "fmr" in name else "C7" for name in names])
-        axis.set(title={"ic": "IC alone", "align": "registration"}[part], xlabel="s")
-        axis.invert_yaxis()
-        axis.tick_params(axis="y", labelsize="x-small")
+    left = [part for part in ("ic", "align") if part in report]
+    right = ["growth"] if "growth" in report else []
+    rows = [[part, *right] for part in left] or [right or ["none"]]
+    panels = figure.subplot_mosaic(rows, width_ratios=[1, 1] if left and right else None)
+    if "ic" in report:
+        names = [r["what"] for r in report["ic"]]
+        colors = [plots.COLORS[0] if "fmr" in name else plots.COLORS[4] for name in names]
+        drawn = panels["ic"].barh(names, [r["s"] for r in report["ic"]], color=colors, height=0.6)
+        panels["ic"].bar_label(drawn, [f"{r['s']:.2g} s" for r in report["ic"]], padding=2, fontsize=7)
+        panels["ic"].set(title="IC alone", xlabel="s", xmargin=0.2)
+        panels["ic"].invert_yaxis()
+        panels["ic"].grid(axis="y", visible=False)
+    if "align" in report:
+        situations, series = situation_series([r for r in report["align"] if not r["what"].startswith("stage")])
+        plots.dots(panels["align"], situations, series)
+        panels["align"].set(title="registration", xlabel="s", xlim=(0, None))
+        plots.names_above(figure, [s.label for s in series])
     if "growth" in report:
-        for method in dict.fromkeys(r["method"] for r in report["growth"]):
-            own = [r for r in report["growth"] if r["method"] == method]
-            axes[0].plot([r["points"] for r in own], [r["s"] for r in own], "o-", label=method)
-        axes[0].set(title="registration", xlabel="points", ylabel="s", xscale="log", yscale="log")
-        axes[0].yaxis.set_minor_formatter("")
-        axes[0].legend(fontsize="x-small")
+        own: dict[str, Rows] = {}
+        for r in report["growth"]:
+            own.setdefault(r["method"], []).append(r)
+        panels["growth"].set(title="registration", xlabel="points", ylabel="s", xscale="log", yscale="log")
+        lines = [plots.Series(m, [r["points"] for r in rs], [r["s"] for r in rs]) for m, rs in own.items()]
+        plots.curves(panels["growth"], lines)
+
+
+def situation_series(rows: Rows) -> tuple[list[str], list[plots.Series]]:
+    """Rows "SITUATION: METHOD" as situations, and a series for each method over them."""
+    split = [(*r["what"].split(": ", 1), r["s"]) for r in rows]
+    situations = list(dict.fromkeys(where for where, _, _ in split))
+    methods = dict.fromkeys(method for _, method, _ in split)
+    own = {m: [(situations.index(where), s) for where, method, s in split if method == m] for m in methods}
+    return situations, [plots.Series(m, *zip(*values, strict=True)) for m, values in own.items()]
 
 
 def main() -> None:
@@ -335,7 +352,7 @@ def main() -> None:
     for part in args.only.split(","):
         report[part] = PARTS[part](setup)
         show(f"{part}: {(PARTS[part].__doc__ or '').splitlines()[0]}", report[part])
-    save(args.out, {"cores": CORES, **report}, lambda figure: plot(figure, report))
+    save(args.out, {"cores": CORES, **report}, lambda figure: plot(figure, report), 4.2)
 
 
 if __name__ == "__main__":

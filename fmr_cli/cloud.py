@@ -85,12 +85,12 @@ class PointCloud:
         return replace(self, attributes={**self.attributes, name: np.asarray(values)})
 
     def transformed(self, T: np.ndarray) -> PointCloud:
-        """The cloud moved by T (4x4, float64, rigid or with a uniform scale s): x -> s R x + t.
+        """The cloud moved by T (4x4, float64, rigid, or with a uniform scale s, or a mirror): x -> s R x + t.
 
         Attributes that are vectors move along (`fmr_cli.vectors`), and so do the sensor's position and the scan's pose.
         """
         moved = replace(self, points=transform_points(T, self.points), attributes=turn_vectors(self.attributes, T))
-        scale = np.cbrt(np.linalg.det(T[:3, :3]))
+        scale = np.cbrt(abs(np.linalg.det(T[:3, :3])))
         if self.las_header is not None and abs(scale - 1) > 1e-6:
             moved.las_header = self.las_header.copy()
             moved.las_header.scales = self.las_header.scales * scale  # as many steps across the cloud as before

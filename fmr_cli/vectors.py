@@ -75,8 +75,8 @@ def stem(name: str) -> str:
 
 
 def turn_vectors(attributes: dict[str, np.ndarray], T: np.ndarray) -> dict[str, np.ndarray]:
-    """The attributes after the points moved by T (4x4, a rotation times one scale): x -> s R x + t."""
-    scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
+    """The attributes after the points moved by T (4x4, a rotation, perhaps with a mirror, times one scale)."""
+    scale = float(np.cbrt(abs(np.linalg.det(T[:3, :3]))))
     R = T[:3, :3] / scale
     moves: dict[str, Callable[[np.ndarray], np.ndarray]] = {
         "direction": lambda v: v @ R.T,
@@ -88,7 +88,9 @@ def turn_vectors(attributes: dict[str, np.ndarray], T: np.ndarray) -> dict[str, 
         if kind in moves:
             put(result, names, moves[kind](stacked(attributes, names)))
     if all(name in attributes for name in ROTATION):
-        put(result, ROTATION, turned_quaternions(stacked(attributes, ROTATION), R))
+        put(
+            result, ROTATION, turned_quaternions(stacked(attributes, ROTATION), R * np.sign(np.linalg.det(R)))
+        )  # ellipsoids are symmetric
     if all(name in attributes for name in (*ROTATION, *LOG_SCALE)):
         put(result, LOG_SCALE, stacked(attributes, LOG_SCALE) + np.log(scale))
     rest = harmonics(attributes)

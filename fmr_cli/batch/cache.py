@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, OrderedDict
-from collections.abc import Iterable
+from collections import OrderedDict
+from collections.abc import Collection
 from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from fmr_cli.cloud import PointCloud
 from fmr_cli.io import read_cloud
 from fmr_cli.registration import Prepared, prepare
 from fmr_cli.registration.prepared import AT_MOST
@@ -18,61 +22,71 @@ CACHED_POINTS = 20_000_000
 
 
 class Key(NamedTuple):
-    """All that a prepared file depends on."""
+    """All that a prepared file depends on. changed: its time of change in ns and bytes, 0 where there is no file."""
 
     path: Path
+    changed: tuple[int, int]
     seed: int
+
+
+@dataclass(frozen=True)
+class ReadyFile:
+    """A file's cloud made ready. said: what the file says of it, without its points."""
+
+    prepared: Prepared
+    said: PointCloud
 
 
 class CloudCache:
     """Files read and prepared, each once even when several threads ask for it.
 
-    A file is let go once no pair needs it any more, and the least recently used where more than ``at_most`` points are
-    kept.
+    The least recently used is let go where more than ``at_most`` points are kept.
     """
 
     def __init__(self, at_most: int = CACHED_POINTS) -> None:
         self.at_most = at_most
-        self.needed: Counter[Path] = Counter()  # how many pairs are still to come that need it
-        self.files: OrderedDict[Key, Future[Prepared]] = OrderedDict()
+        self.files: OrderedDict[Key, Future[ReadyFile]] = OrderedDict()
         self.lock = threading.Lock()
 
-    def expect(self, paths: Iterable[Path]) -> None:
-        """Each path once for each pair to come that needs it."""
-        with self.lock:
-            self.needed.update(paths)
-
-    def get(self, path: Path, *, seed: int) -> Prepared:
+    def get(self, path: Path, *, seed: int) -> ReadyFile:
         """A file's cloud; where it could not be read, the same error each time.
 
         seed: of the sample that is looked at where the file is large.
         """
-        key = Key(path, seed)
+        key = Key(path, changed(path), seed)
         with self.lock:
             known = self.files.get(key)
             future = self.files.setdefault(key, known or Future())
             self.files.move_to_end(key)
         if known is None:
             try:
-                future.set_result(prepare(read_cloud(path, attributes=False, at_most=AT_MOST), seed))
+                cloud = read_cloud(path, attributes=False, at_most=AT_MOST)
+                said = replace(cloud, points=np.empty((0, 3)), attributes={}, total=cloud.count)
+                future.set_result(ReadyFile(prepare(cloud, seed), said))
             except BaseException as error:
                 future.set_exception(error)
             self._keep_within_bound()
         return future.result()
 
-    def done_with(self, *paths: Path) -> None:
-        """A pair of these files is done."""
+    def let_go(self, paths: Collection[Path]) -> None:
+        """No pair to come needs these files."""
         with self.lock:
-            self.needed.subtract(paths)
-            unneeded = {path for path in paths if self.needed[path] <= 0}
-            for key in [key for key in self.files if key.path in unneeded]:
+            for key in [key for key in self.files if key.path in paths]:
                 del self.files[key]
 
     def _keep_within_bound(self) -> None:
         with self.lock:
-            read = {key: len(f.result().points) for key, f in self.files.items() if f.done() and not f.exception()}
-            held = sum(read.values())
-            for key, points in read.items():
+            done = {key: f.result() for key, f in self.files.items() if f.done() and not f.exception()}
+            held = sum(len(ready.prepared.points) for ready in done.values())
+            for key, ready in done.items():
                 if held > self.at_most:
-                    held -= points
+                    held -= len(ready.prepared.points)
                     del self.files[key]
+
+
+def changed(path: Path) -> tuple[int, int]:
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_mtime_ns, status.st_size

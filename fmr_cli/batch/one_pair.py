@@ -1,4 +1,4 @@
-"""One pair of a batch: read, register, write its transform and clouds; its row, whatever happens."""
+"""Pairs of a batch, as a worker does them: read, register, write their clouds; and what there is to say of each."""
 
 from __future__ import annotations
 
@@ -13,55 +13,82 @@ from fmr_cli.batch.cache import CloudCache
 from fmr_cli.batch.manifest import Pair
 from fmr_cli.batch.results import COLUMNS
 from fmr_cli.errors import FmrError, ModelError
-from fmr_cli.io import WRITABLE, open_cloud, write_cloud, write_transform
+from fmr_cli.io import WRITABLE, open_cloud, write_cloud
 from fmr_cli.io.files import reason
 from fmr_cli.registration import Options, Registration, align
-from fmr_cli.registration.export import aligned_cloud, merged_cloud
+from fmr_cli.registration.export import aligned_cloud, merged_cloud, metrics
 from fmr_cli.registration.options import read_init
+from fmr_cli.workers.base import check_there, kept
+
+
+@dataclass(frozen=True)
+class Block:
+    """Pairs that one worker does one after the other, since they share files.
+
+    spent: files that no later pair needs. there: files that a worker on another machine has to see as well.
+    """
+
+    pairs: tuple[Pair, ...]
+    spent: frozenset[Path] = frozenset()
+    there: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a pair has given. T_target_source, metrics: None where it failed."""
+
+    row: dict[str, Any]
+    T_target_source: np.ndarray | None = None
+    metrics: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class PairRunner:
-    """Registers pairs, in any thread.
+    """Registers pairs, in any process.
 
-    folder: what the manifest's paths are relative to. out: the batch's folder. aligned, merged: also write each pair's
-    moved source, or both clouds in one.
+    folder: what the manifest's paths are relative to; out: the batch's folder; both absolute. aligned, merged: also
+    write each pair's moved source, or both clouds in one. cached_points: of files that a process keeps.
     """
 
     folder: Path
     out: Path
     options: Options
-    cache: CloudCache
     aligned: bool
     merged: bool
+    cached_points: int
 
     def files(self, pair: Pair) -> tuple[Path, Path]:
         return self.folder / pair.source, self.folder / pair.target
 
-    def row(self, pair: Pair) -> dict[str, Any]:
-        """One pair's row of results.csv; its transform and clouds are written before. Raises ModelError alone."""
-        row = dict.fromkeys(COLUMNS, "") | {"source": pair.source, "target": pair.target}
+    def do(self, block: Block) -> list[Done]:
+        """The block's pairs. Raises ModelError, and UnfitError where this machine lacks a file that others have."""
+        check_there(block.there)
+        cache = kept("batch", lambda: CloudCache(self.cached_points))
+        done = [self.one(pair, cache) for pair in block.pairs]
+        cache.let_go(block.spent)
+        return done
+
+    def one(self, pair: Pair, cache: CloudCache) -> Done:
+        """One pair; its clouds are written. Raises ModelError alone, which is the same for every pair."""
         start = time.perf_counter()
         try:
-            row |= self._registered(pair)
-        except ModelError:  # the same for every pair
+            done = self._registered(pair, cache)
+        except ModelError:
             raise
         except FmrError as error:
-            row |= {"status": "failed", "message": " ".join(str(error).split())}
+            done = failed(pair, " ".join(str(error).split()))
         except Exception as error:  # whatever one pair runs into, the others go on
-            row |= {"status": "failed", "message": f"{type(error).__name__}: {reason(error)}"}
-        finally:
-            self.cache.done_with(*self.files(pair))
-        return row | {"seconds": f"{time.perf_counter() - start:.3f}"}
+            done = failed(pair, f"{type(error).__name__}: {reason(error)}")
+        return replace(done, row=done.row | {"seconds": f"{time.perf_counter() - start:.3f}"})
 
-    def _registered(self, pair: Pair) -> dict[str, Any]:
+    def _registered(self, pair: Pair, cache: CloudCache) -> Done:
         options = replace(self.options, init=read_init(pair.init, self.folder)) if pair.init else self.options
-        source, target = (self.cache.get(path, seed=self.options.seed) for path in self.files(pair))
-        found = align(source, target, options, threads=1)
-        warnings = [*found.reasons, *found.warnings, *self._write_clouds(pair, found.T_target_source)]
-        transform = f"transforms/{pair.name}.txt"
-        write_transform(self.out / transform, found.T_target_source)
-        return described(found) | {"transform": transform, "message": "; ".join(warnings)}
+        source, target = (cache.get(path, seed=self.options.seed) for path in self.files(pair))
+        found = align(source.prepared, target.prepared, options, threads=1)
+        said = [*found.reasons, *found.warnings, *self._write_clouds(pair, found.T_target_source)]
+        row = empty_row(pair) | described(found)
+        row |= {"transform": f"transforms/{pair.name}.txt", "message": "; ".join(said)}
+        return Done(row, found.T_target_source, metrics(source.said, target.said, found))
 
     def _write_clouds(self, pair: Pair, T_target_source: np.ndarray) -> list[str]:
         """Writes the clouds that are wanted; returns warnings about what a format cannot hold."""
@@ -76,6 +103,14 @@ class PairRunner:
             merged, said = merged_cloud(open_cloud(source), open_cloud(target), T_target_source)
             warnings += said + write_cloud(self.out / "merged" / f"{pair.name}{suffix_for(target)}", merged)
         return warnings
+
+
+def empty_row(pair: Pair) -> dict[str, Any]:
+    return dict.fromkeys(COLUMNS, "") | {"source": pair.source, "target": pair.target}
+
+
+def failed(pair: Pair, message: str) -> Done:
+    return Done(empty_row(pair) | {"status": "failed", "seconds": "0.000", "message": message})
 
 
 def described(found: Registration) -> dict[str, str]:

@@ -12,7 +12,7 @@ from typing import Any, TextIO
 from fmr_cli.batch.manifest import Pair
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import check_writable
-from fmr_cli.io.outputs import write_json
+from fmr_cli.io.outputs import cell, write_json
 
 COLUMNS = (
     "source", "target", "status", "seconds", "transform", "overlap", "inlier_rmse", "feature_error", "confidence",
@@ -62,14 +62,14 @@ class ResultsTable:
             )
         rows = list(csv.DictReader(StringIO(whole.decode("utf-8"), newline="")))
         made_from = [(row.get("source"), row.get("target")) for row in rows]
-        if not whole.startswith(head) or made_from != [(p.source, p.target) for p in pairs[: len(rows)]]:
+        if not whole.startswith(head) or made_from != [(cell(p.source), cell(p.target)) for p in pairs[: len(rows)]]:
             raise CloudFileError(f"{self.path}: was made from another manifest, give another --out")
         return rows
 
     def add(self, row: dict[str, Any]) -> None:
         """A row, on the disk when this returns."""
         assert self.file
-        csv.DictWriter(self.file, COLUMNS, lineterminator="\n").writerow(row)
+        csv.DictWriter(self.file, COLUMNS, lineterminator="\n").writerow({name: cell(row[name]) for name in row})
         self.file.flush()
         os.fsync(self.file.fileno())
 

@@ -18,12 +18,14 @@ from fmr_cli.cli.align import align_command
 from fmr_cli.cli.batch import batch_command
 from fmr_cli.cli.console import BAD_INPUT, complain
 from fmr_cli.cli.evaluate import evaluate_command
+from fmr_cli.cli.example import example_command
 from fmr_cli.cli.info import info_command
 from fmr_cli.cli.multiway import multiway_command
 from fmr_cli.cli.options import Debug, takes_debug
 from fmr_cli.cli.sequence import sequence_command
 from fmr_cli.cli.train import train_command
 from fmr_cli.cli.transform import transform_command
+from fmr_cli.cli.view import view_command
 from fmr_cli.errors import FmrError
 
 app = typer.Typer(
@@ -38,8 +40,10 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "sequence": sequence_command,
     "info": info_command,
     "transform": transform_command,
+    "view": view_command,
     "train": train_command,
     "evaluate": evaluate_command,
+    "example": example_command,
 }
 for name, command in COMMANDS.items():
     app.command(name)(takes_debug(command))

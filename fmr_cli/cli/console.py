@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from fmr_cli.cloud import PointCloud
     from fmr_cli.io.stream import CloudStream
 
-err = Console(stderr=True, highlight=False, soft_wrap=True)
+err = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
-BAD_INPUT, UNCERTAIN = 2, 3  # exit codes
+BAD_INPUT, UNCERTAIN, STOPPED = 2, 3, 130  # exit codes; the last one after Ctrl-C, as shells have it
 
 
 def say(*lines: str, quiet: bool = False) -> None:

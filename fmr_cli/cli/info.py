@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from fmr_cli.cli.console import BAD_INPUT, busy, complain
-from fmr_cli.cli.options import BinColumns, columns
+from fmr_cli.cli.options import BinColumns, Bounds, Resolution, Topic, columns
 from fmr_cli.errors import FmrError
 
 
@@ -17,6 +17,9 @@ def info_command(
     files: Annotated[list[Path], typer.Argument(help="Clouds or meshes.", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON array, one object a file.")] = False,
     bin_columns: BinColumns = None,
+    bounds: Bounds = None,
+    resolution: Resolution = None,
+    topic: Topic = None,
 ) -> None:
     """Say what is in each of the FILES. FILE#2 or FILE#name is one scan of a file that holds several."""
     from fmr_cli import io
@@ -26,7 +29,10 @@ def info_command(
     for path in files:
         try:
             with busy(f"reading {path.name}", as_json):
-                found.append(describe(io.open_cloud(path, bin_columns=columns(bin_columns))))
+                stream = io.open_cloud(
+                    path, bin_columns=columns(bin_columns), bounds=bounds, resolution=resolution, topic=topic
+                )
+                found.append(describe(stream))
         except FmrError as error:
             complain(error)
             continue

@@ -8,11 +8,10 @@ from typing import Annotated
 
 import typer
 
-from fmr_cli.cli.console import UNCERTAIN, progress, quick_imports, say, show_log, warn
-from fmr_cli.cli.options import Quiet, Verbose, takes_registration_options
+from fmr_cli.cli.console import STOPPED, UNCERTAIN, busy, progress, quick_imports, say, show_log, warn
+from fmr_cli.cli.options import Dask, Quiet, Report, Verbose, check_report, chosen_workers, takes_registration_options
 from fmr_cli.registration.options import Options
 
-STOPPED = 130  # exit code after Ctrl-C, as shells have it
 TAKEN = ("voxel_size", "dof", "up", "max_angle", "max_shift", "model", "device", "seed")  # options of a pair
 
 
@@ -51,11 +50,14 @@ def multiway_command(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Pairs at a time; one a core if not given.", show_default=False)
     ] = None,
+    dask: Dask = None,
+    report: Report = None,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
     """Find a common frame for many SCANS: a pose for each, a table of links, a word on both."""
     show_log(verbose)
+    check_report(report)
     with quick_imports():
         from fmr_cli.io import WRITABLE
         from fmr_cli.io.outputs import check_outputs
@@ -71,7 +73,7 @@ def multiway_command(
         tuple(fixed or ()),
         anchor,
     )
-    with progress(quiet) as bar:
+    with chosen_workers(workers, dask, quiet) as team, progress(quiet) as bar:
         task = bar.add_task("reading", total=None, said="")
 
         def show(now: Progress) -> None:
@@ -79,7 +81,7 @@ def multiway_command(
             bar.update(task, description=now.stage, completed=now.done, total=now.total, said=said)
 
         try:
-            network = align_many(scans, options, known=known, out=out, resume=resume, workers=workers, progress=show)
+            network = align_many(scans, options, known=known, out=out, resume=resume, workers=team, progress=show)
         except KeyboardInterrupt:
             say(f"stopped; what is done is kept in {out}, --resume goes on", quiet=quiet)
             raise typer.Exit(STOPPED) from None
@@ -87,6 +89,11 @@ def multiway_command(
         export.write_network(network, out)
         warnings = export.write_aligned(network, out) if aligned else []
         warnings += export.write_merged(network, merged, merged_voxel or None) if merged else []
+    if report:
+        with busy("writing the report", quiet):
+            from fmr_cli.report.multiway_page import write_multiway
+
+            write_multiway(report, network, export.summary(network))
     say(*export.summary(network), quiet=quiet)
     warn(*dict.fromkeys(warnings), quiet=quiet)
     say(f"{out / 'scans.csv'}, {out / 'links.csv'}", quiet=quiet)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fmr_cli.cli.console import UNCERTAIN, progress, say, show_log
-from fmr_cli.cli.options import Quiet, Verbose
+from fmr_cli.cli.console import UNCERTAIN, busy, progress, say, show_log
+from fmr_cli.cli.options import Quiet, Report, Topic, Verbose, check_report
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 def sequence_command(
     scans: Annotated[
         Path,
-        typer.Argument(help="A folder of scans, a KITTI sequence or drive, or a list (.txt).", show_default=False),
+        typer.Argument(
+            help="A folder of scans, a KITTI sequence or drive, a bag, or a list (.txt).", show_default=False
+        ),
     ],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="The poses, each frame to the first, in the sensor's frame.")
@@ -35,41 +37,62 @@ def sequence_command(
         float | None, typer.Option(help="The map's voxel edge; half the working one if not given.", min=0.0)
     ] = None,
     voxel_size: Annotated[
-        float | None, typer.Option(help="The working voxel edge; from the data if not given.", min=0.0)
+        float | None, typer.Option(help="A wish for the working voxel edge, which the scans' density bounds.", min=0.0)
+    ] = None,
+    init_poses: Annotated[
+        Path | None,
+        typer.Option(help="Poses known beforehand, by odometry or GNSS: CSV of scan,pose[,sigma_rot_deg,sigma_shift]."),
+    ] = None,
+    known_map: Annotated[
+        Path | None, typer.Option("--map", help="A known map: poses are those in it, the first scan is found in it.")
     ] = None,
     loop_closure: Annotated[
         bool, typer.Option("--loop-closure", help="Close loops in --out; the path before goes to NAME.odometry.*.")
     ] = False,
     deskew: Annotated[
-        bool, typer.Option("--deskew", help="Undo the motion within each scan, by the times of its points.")
-    ] = False,
+        bool | None,
+        typer.Option("--deskew/--no-deskew", help="Undo the motion within each scan; done if its points have times."),
+    ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="True poses, KITTI rows: errors beside --out as .evaluation.json and .png.")
+        Path | None, typer.Option(help="True poses (KITTI, TUM, .npy): errors and a plot beside --out.")
     ] = None,
     start: Annotated[int, typer.Option(help="The first scan, counted from 0.", min=0)] = 0,
     stop: Annotated[int | None, typer.Option(help="The scan before which to stop; none if not given.", min=0)] = None,
     step: Annotated[int, typer.Option(help="Take every so many-th scan.", min=1)] = 1,
+    report: Report = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a stopped run has left off.")] = False,
+    topic: Topic = None,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
     """Register every scan of a sequence into the frame of the first."""
     from fmr_cli import io
     from fmr_cli.io import outputs
+    from fmr_cli.io.parts import with_topic
+    from fmr_cli.multiway.known import read_init_poses
     from fmr_cli.sequence import SequenceOptions, align_sequence, find_scans
 
     show_log(verbose)
+    check_report(report)
     outputs.check_outputs([(out, (out.suffix.lower(),)), (residuals, (".csv",)), (merged, io.WRITABLE)])
-    found = find_scans(scans, start, stop, step, [path for path in (out, residuals, merged) if path])
+    found = find_scans(with_topic(scans, topic), start, stop, step, [path for path in (out, residuals, merged) if path])
     say(*found.notes, quiet=quiet)
     true = read_truth(truth, found) if truth else None
     options = SequenceOptions(
         format=form, camera_frame=camera_frame, voxel_size=voxel_size or None, merged_voxel=merged_voxel or None,
         loop_closure=loop_closure, deskew=deskew,
     )  # fmt: skip
+    told = read_init_poses(init_poses) if init_poses else None
     with progress(quiet) as bar:
-        on_row = follow(bar, quiet)
-        result = align_sequence(found, out, options, residuals=residuals, merged=merged, resume=resume, on_row=on_row)
+        result = align_sequence(
+            found, out, options, init_poses=told, known_map=known_map, residuals=residuals, merged=merged,
+            resume=resume, on_row=follow(bar, quiet),
+        )  # fmt: skip
+    if report:
+        with busy("writing the report", quiet):
+            from fmr_cli.report.sequence_page import write_sequence
+
+            write_sequence(report, result, found, options)
     say(*result.summary(), quiet=quiet)
     if true is not None:
         compare(result.poses, true, out, quiet)
@@ -81,7 +104,7 @@ def read_truth(path: Path, found: Any) -> np.ndarray:
     """(n, 4, 4): the true poses of the chosen scans. Raises FmrError before anything is registered."""
     from fmr_cli.evaluation import trajectory
 
-    return trajectory.read_truth(path, found.chosen, found.total)
+    return trajectory.read_truth(path, found.chosen, found.total, found.times)
 
 
 def follow(bar: Progress, quiet: bool) -> Callable[[dict[str, Any], int, int], None]:
@@ -105,8 +128,9 @@ def compare(poses: np.ndarray, true: np.ndarray, out: Path, quiet: bool) -> None
     """Errors against the truth, and a plot, beside ``out``."""
     from fmr_cli.evaluation import trajectory
     from fmr_cli.io import outputs
+    from fmr_cli.report.trajectory import plot_paths
 
     errors = trajectory.evaluate(poses, true)
     outputs.write_json(out.with_suffix(".evaluation.json"), errors)
-    trajectory.plot(out.with_suffix(".png"), poses, true)
+    plot_paths(out.with_suffix(".png"), poses, true)
     say(*trajectory.summary(errors), quiet=quiet)

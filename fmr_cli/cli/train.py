@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fmr_cli.cli.console import err, progress, say, warn
+from fmr_cli.cli.options import Report, Topic, check_report
 from fmr_cli.errors import FmrError
 
 if TYPE_CHECKING:
@@ -18,11 +19,14 @@ if TYPE_CHECKING:
 
 def train_command(
     scans: Annotated[
-        list[Path] | None, typer.Argument(help="Scans, meshes, or folders of them.", show_default=False)
+        list[Path] | None, typer.Argument(help="Scans, meshes, bags, or folders of scans.", show_default=False)
     ] = None,
-    unsupervised: Annotated[bool, typer.Option("--unsupervised", help="The Chamfer loss alone; no label.")] = False,
+    unsupervised: Annotated[bool, typer.Option("--unsupervised", help="From the scans alone; no label.")] = False,
     semi_supervised: Annotated[
-        bool, typer.Option("--semi-supervised", help="And the point error of registering moved, cut, noisy copies.")
+        bool,
+        typer.Option(
+            "--semi-supervised", help="And, for the global encoder, the error of registering moved, cut, noisy copies."
+        ),
     ] = False,
     pairs: Annotated[Path | None, typer.Option(help="Labelled pairs, CSV: source, target, transform.")] = None,
     recipe: Annotated[Path | None, typer.Option(help="All settings, .toml; options given here go before it.")] = None,
@@ -47,15 +51,24 @@ def train_command(
     overlap: Annotated[float | None, typer.Option(help="Least overlap.", show_default="0.6", min=0.1, max=1.0)] = None,
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same weights (CPU).", min=0)] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to train.")] = "auto",
+    report: Report = None,
+    topic: Topic = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
 ) -> None:
-    """Learn an encoder from SCANS, starting from the bundled one; see what it gained.
+    """Learn from SCANS what registration uses, starting from the bundled model; see what it gained.
 
-    A recipe of kind "local" trains the encoder of local patches, on made-up scans alone.
-    The folder of the run gets model.safetensors (the best epoch's weights, for `fmr align --model`), README.md (what
-    they were made from, held-out figures), recipe.toml, metrics.csv and state.safetensors (for --resume).
+    The scans are registered with each other, in rounds; where two show one place the local features learn to match,
+    and the encoder of whole clouds goes on as well. At the end, held-out pairs are registered before and after, and
+    what has got worse is not kept. A recipe may be of another kind: "global", or "local" on made-up scans alone.
+    The folder of the run gets model.safetensors (for `--model` of align, batch, sequence, multiway), README.md (what
+    it was made from, held-out figures), training.png, recipe.toml, metrics.csv, registered.json (the poses found) and
+    state.safetensors (for --resume).
     """
+    from fmr_cli.io.parts import with_topic
     from fmr_cli.training.run import prepare, settings
+
+    check_report(report)
+    scans = [with_topic(path, topic) for path in scans or []] or None
 
     if resume and (unsupervised or semi_supervised or recipe or start or learning_rate is not None or seed is not None):
         raise FmrError("--resume goes on with the settings saved in --out; leave the other settings away")
@@ -77,7 +90,14 @@ def train_command(
         warn(*warnings, quiet=quiet)
         say(f"learning from {'; '.join(trainer.task.described)}", quiet=quiet)
         bar.update(task, description="testing", total=None, said="what is held out, before training")
+        trainer.show = lambda what, done, total: bar.update(
+            task, description=what, completed=done, total=total, said=""
+        )
         stopped = learn(trainer, partial(bar.update, task), quiet)
+    if report and trainer.rank == 0 and trainer.progress.scores:
+        from fmr_cli.report.training_page import write_training
+
+        write_training(report, trainer, stopped)
     if not quiet:
         conclude(trainer, stopped)
 
@@ -91,6 +111,7 @@ def learn(trainer: Trainer, show: Callable[..., None], quiet: bool) -> bool:
     try:
         for report in trainer.run():
             show(description="training", completed=report.step, total=report.steps, said=line(report))
+            say(*report.notes, quiet=quiet)
             if report.row:
                 say(epoch_line(report.row), quiet=quiet)
             if report.row and board is not None:
@@ -108,10 +129,14 @@ def learn(trainer: Trainer, show: Callable[..., None], quiet: bool) -> bool:
 
 def conclude(trainer: Trainer, stopped: bool) -> None:
     """What was gained, as a table and in words."""
-    from fmr_cli.report.training import table, verdict
+    from fmr_cli.report.training import check_report, plot, table, verdict
 
     if not trainer.progress.scores:
         say("stopped before the first test: nothing was written")
         return
     err.print(table(trainer))
+    if (checked := check_report(trainer)) is not None:
+        err.print(checked)
+    if missing := plot(trainer):
+        say(missing)
     say(verdict(trainer, stopped))

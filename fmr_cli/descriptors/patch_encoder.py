@@ -7,7 +7,9 @@ are in voxel edges, so that nothing depends on a unit. Trained by ``training.loc
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -30,15 +32,37 @@ class LocalEncoder:
     head: Layers
 
     @classmethod
+    def of(cls, arrays: dict[str, np.ndarray]) -> LocalEncoder:
+        """The encoder of arrays ``point.0.weight``, ... Raises ValueError where they are none."""
+        parts = [
+            [(arrays[f"{part}.{i}.weight"], arrays[f"{part}.{i}.bias"])
+             for i in range(len(arrays)) if f"{part}.{i}.weight" in arrays]
+            for part in ("point", "head")
+        ]  # fmt: skip
+        width = CHANNELS
+        for weight, bias in [*parts[0], *parts[1]]:
+            if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
+                raise ValueError(f"a layer is {weight.shape} where {width} values come in")
+            width = len(weight)
+        if not all(parts) or 2 * sum(map(len, parts)) != len(arrays):
+            raise ValueError("layers are missing")
+        return cls(*parts)
+
+    @classmethod
     def load(cls, path: Path) -> LocalEncoder:
+        """The encoder of a file of its own, as ``models/local.safetensors`` is."""
         from safetensors.numpy import load_file
 
-        w = load_file(path)
-        layers = [
-            [(w[f"{part}.{i}.weight"], w[f"{part}.{i}.bias"]) for i in range(len(w)) if f"{part}.{i}.weight" in w]
-            for part in ("point", "head")
-        ]
-        return cls(*layers)
+        return cls.of(load_file(path))
+
+    @cached_property
+    def key(self) -> str:
+        """Tells encoders of other weights apart, wherever they lie in memory."""
+        digest = hashlib.sha256()
+        for weight, bias in [*self.point, *self.head]:
+            digest.update(weight.tobytes())
+            digest.update(bias.tobytes())
+        return digest.hexdigest()
 
     def __call__(self, patches: np.ndarray) -> np.ndarray:
         """(K, PATCH_POINTS, CHANNELS) -> (K, 32) unit descriptors."""

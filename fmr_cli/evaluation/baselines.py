@@ -114,8 +114,30 @@ def missing(package: str) -> str | None:
     return None if importlib.util.find_spec(package) else f"{package} is not installed"
 
 
+Voxel = Callable[[np.ndarray, np.ndarray], float]  # of source and target: the edge of the grid that suits them
+
+
 def global_baselines(voxel: float) -> tuple[dict[str, Baseline], list[str]]:
     """The baselines of GLOBAL that can run, on that voxel edge, and a line for each that cannot."""
+    return global_baselines_at(lambda source, target: voxel)
+
+
+def global_baselines_at(voxel: Voxel) -> tuple[dict[str, Baseline], list[str]]:
+    """The same, on a voxel edge that follows from the pair."""
     reasons = {name: missing(package) for name, (_, package) in GLOBAL.items()}
-    there: dict[str, Baseline] = {n: partial(f, voxel=voxel) for n, (f, _) in GLOBAL.items() if reasons[n] is None}
+
+    def at(run: Callable[..., np.ndarray], source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return run(source, target, voxel=voxel(source, target))
+
+    there: dict[str, Baseline] = {n: partial(at, f) for n, (f, _) in GLOBAL.items() if reasons[n] is None}
     return there, [f"no {name}: {reason}" for name, reason in reasons.items() if reason is not None]
+
+
+def then_gicp(start: Baseline, voxel: Voxel, edges: float = GICP_REACH, threads: int = 1) -> Baseline:
+    """A baseline, and GICP from where it ends, as one would use it. edges: to the farthest correspondence."""
+
+    def run(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        edge = voxel(source, target)
+        return gicp(source, target, edge, start=start(source, target), reach=edges * edge, threads=threads)
+
+    return run

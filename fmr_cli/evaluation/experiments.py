@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -106,22 +105,24 @@ def read_clouds(path: Path, count: int | None, points: int, device: torch.device
     return Clouds(path.name or str(path), torch.from_numpy(np.stack(found)).to(device), skipped)
 
 
-def run(
-    experiment: Experiment, clouds: Clouds, methods: dict[str, Method], pairs: int, points: int, seed: int
-) -> Iterator[Row]:
-    """Every method on the same ``pairs`` random pairs at every level."""
-    for number, (level, setting) in enumerate(experiment.levels):
-        drawn = draw(clouds.points, setting, pairs, points, seed + number)
-        for name, method in methods.items():
-            started = time.perf_counter()
-            estimate = method(drawn)
-            seconds = (time.perf_counter() - started) / pairs
-            e = errors(estimate, drawn.truth)
-            means, medians = ([float(f(x)) for x in (e.rotation, e.translation, e.rmse)] for f in (np.mean, np.median))
-            yield Row(
-                experiment.name, clouds.name, name, float(level), pairs, e.success, means[0], medians[0],
-                means[1], medians[1], means[2], medians[2], seconds,
-            )  # fmt: skip
+def at_level(
+    experiment: Experiment, number: int, clouds: Clouds, methods: dict[str, Method], pairs: int, points: int, seed: int
+) -> list[Row]:
+    """Every method on the same ``pairs`` random pairs at one level, by its number."""
+    level, setting = experiment.levels[number]
+    drawn = draw(clouds.points, setting, pairs, points, seed + number)
+    rows = []
+    for name, method in methods.items():
+        started = time.perf_counter()
+        estimate = method(drawn)
+        seconds = (time.perf_counter() - started) / pairs
+        e = errors(estimate, drawn.truth)
+        means, medians = ([float(f(x)) for x in (e.rotation, e.translation, e.rmse)] for f in (np.mean, np.median))
+        rows.append(Row(
+            experiment.name, clouds.name, name, float(level), pairs, e.success, means[0], medians[0],
+            means[1], medians[1], means[2], medians[2], seconds,
+        ))  # fmt: skip
+    return rows
 
 
 @torch.inference_mode()

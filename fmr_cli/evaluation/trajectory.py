@@ -9,31 +9,79 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
-from fmr_cli.errors import FmrError
+from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import read_poses
-from fmr_cli.io.files import atomic_write
+from fmr_cli.io.files import check_readable
+from fmr_cli.io.transforms import as_transform, number_rows
 
 KITTI_LENGTHS = tuple(range(100, 801, 100))  # m, of the segments; from KITTI's odometry devkit, as is the next
 KITTI_STEP = 10  # frames between the starts of segments: one second
 TENTHS = tuple(range(1, 9))  # of a path shorter than KITTI's segments: its own segments' lengths
 
 
-def read_truth(path: Path, chosen: range, total: int) -> np.ndarray:
-    """(n, 4, 4) true poses of the chosen scans, by a file with a row for each of them, or for all ``total``.
+def read_truth(path: Path, chosen: range, total: int, times: np.ndarray | None = None) -> np.ndarray:
+    """(n, 4, 4) true poses of the chosen scans: KITTI rows, TUM rows, or .npy of (m, 4, 4), (m, 3, 4) or (m, 12).
 
-    Raises FmrError where the number of rows is another, or evo or matplotlib is not installed.
+    A file has a row for each chosen scan, or for all ``total``. TUM rows have times of their own: where the chosen
+    scans have theirs too (n,), seconds, poses are interpolated at them.
+    Raises FmrError where the number of rows is another or a time lies outside, or evo or matplotlib is not installed.
     """
     missing = [name for name in ("evo", "matplotlib") if importlib.util.find_spec(name) is None]
     if missing:
         raise FmrError(f"--truth needs {' and '.join(missing)}: pip install 'fmr-cli[eval]'")
-    poses = read_poses(path)
+    poses, stamps = read_trajectory(path)
+    if stamps is not None and times is not None:
+        return at_times(path, poses, stamps, times)
     if len(poses) == total:
         return poses[np.array(chosen)]
     if len(poses) != len(chosen):
         raise FmrError(f"{path}: {len(poses)} poses for {len(chosen)} scans, give a row for each scan")
     return poses
+
+
+def read_trajectory(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Poses (m, 4, 4) of a file, and their times (m,), seconds, where they are TUM rows. Raises CloudFileError."""
+    check_readable(path)
+    if path.suffix.lower() == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False).astype(np.float64)
+            values = values.reshape(len(values), *{12: (3, 4), 16: (4, 4)}[values[0].size])
+        except (ValueError, KeyError, TypeError, IndexError, EOFError) as error:
+            raise CloudFileError(f"{path}: is no array of poses ({error}), expected (n, 4, 4) or (n, 12)") from None
+        return np.stack([as_transform(T) for T in values]), None
+    try:
+        rows = list(number_rows(path))
+    except CloudFileError as error:
+        raise CloudFileError(f"{path}: {error}") from None
+    if {len(row) for row in rows} != {8}:
+        return read_poses(path), None
+    table = np.array(rows)
+    length = np.linalg.norm(table[:, 4:], axis=1)
+    if not np.isfinite(table).all() or not (length > 0).all() or not (np.diff(table[:, 0]) > 0).all():
+        raise CloudFileError(f"{path}: its times must grow and its quaternions not be 0, as TUM has them")
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
+    poses[:, :3, 3] = table[:, 1:4]
+    return poses, table[:, 0]
+
+
+def at_times(path: Path, poses: np.ndarray, stamps: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Poses (m, 4, 4) known at ``stamps`` (m,), at ``times`` (n,): shifts linear, turns on the shortest way."""
+    slack = float(np.median(np.diff(stamps))) / 2 if len(stamps) > 1 else 0.0
+    outside = np.flatnonzero((times < stamps[0] - slack) | (times > stamps[-1] + slack))
+    if len(outside) or len(stamps) < 2:
+        raise FmrError(
+            f"{path}: its times run from {stamps[0]:.9g} to {stamps[-1]:.9g}, {len(outside)} of {len(times)} scans lie "
+            f"outside (from {times.min():.9g} to {times.max():.9g}); choose scans by --start and --stop"
+        )
+    times = np.clip(times, stamps[0], stamps[-1])
+    found = np.tile(np.eye(4), (len(times), 1, 1))
+    found[:, :3, :3] = Slerp(stamps, Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
+    found[:, :3, 3] = np.stack([np.interp(times, stamps, axis) for axis in poses[:, :3, 3].T], 1)
+    return found
 
 
 @dataclass(frozen=True)
@@ -126,21 +174,3 @@ def summary(errors: dict[str, Any]) -> list[str]:
         f"{errors['rpe_rotation_deg_rmse']:.4g} deg a frame, end drift {errors['end_drift_percent']:.3f} %"
     )
     return lines
-
-
-def plot(path: Path, poses: np.ndarray, truth: np.ndarray) -> None:
-    """Both paths from above (the two axes along which the truth extends most), as .png, .pdf or .svg."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    paths = [(np.linalg.inv(p[0]) @ p)[:, :3, 3] for p in (truth, poses)]
-    a, b = sorted(np.argsort(np.ptp(paths[0], axis=0))[-2:])
-    figure = Figure(figsize=(6, 6), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    for positions, style, label in zip(paths, ("k--", "C0-"), ("truth", "fmr"), strict=True):
-        axes.plot(positions[:, a], positions[:, b], style, label=label)
-    axes.set(aspect="equal", xlabel="xyz"[a], ylabel="xyz"[b])
-    axes.legend()
-    with atomic_write(path) as part:
-        figure.savefig(part)

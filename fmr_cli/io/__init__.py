@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +14,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
-from fmr_cli.io.parts import ScanPart
+from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name, topic_of
 from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
 from fmr_cli.vectors import unturned
@@ -33,16 +33,19 @@ FORMATS = {
     ".pts": ("text", "pts"),
     ".ptx": ("ptx", "ptx"),
     ".e57": ("e57", "e57"),
+    ".bag": ("bags", "bag"),
+    ".mcap": ("bags", "bag"),
+    ".db3": ("bags", "bag"),
     ".npy": ("numpy_files", "npy"),
     ".npz": ("numpy_files", "npz"),
     ".off": ("mesh", "mesh"),
     ".obj": ("mesh", "mesh"),
     ".stl": ("mesh", "mesh"),
 }
-PARTED = ("e57", "ptx")  # modules whose files may hold several scans
+PARTED = ("e57", "ptx", "bags")  # modules whose files may hold several scans
 PACKED = tuple(f"{suffix}.gz" for suffix, (module, _) in FORMATS.items() if module == "text")
 SUFFIXES = (*FORMATS, *PACKED)
-WRITABLE = tuple(suffix for suffix, (module, _) in FORMATS.items() if module not in ("mesh",))
+WRITABLE = tuple(suffix for suffix, (module, _) in FORMATS.items() if module not in ("mesh", "bags"))
 
 __all__ = [
     "SUFFIXES",
@@ -53,6 +56,7 @@ __all__ = [
     "read_cloud",
     "read_poses",
     "read_transform",
+    "scan_paths",
     "scans_of",
     "transform_text",
     "write_cloud",
@@ -68,11 +72,22 @@ def open_cloud(
     seed: int = 0,
     attributes: bool = True,
     bin_columns: tuple[str, ...] | None = None,
+    bounds: Sequence[float] | None = None,
+    resolution: float | None = None,
+    topic: str | None = None,
+    enough: int | None = None,
 ) -> CloudStream:
-    """A point cloud to be read a chunk at a time; nothing is read yet, but the file is there. As `read_cloud`."""
+    """A point cloud to be read a chunk at a time; nothing is read yet, but the file is there. As `read_cloud`.
+
+    enough: a reader that can (COPC) may stop at so many points that are spread evenly.
+    """
     module, kind, file, part = find_module(Path(path), SUFFIXES)
-    check_readable(file)
-    wanted = Wanted(attributes, part, bin_columns)
+    if not is_bag_folder(file):
+        check_readable(file)
+    box = checked_bounds(bounds)
+    if resolution is not None and module.__name__ != "fmr_cli.io.las":
+        raise CloudFileError(f"{path}: has no levels, --resolution needs a COPC (.copc.laz)")
+    wanted = Wanted(attributes, part, bin_columns, box, resolution, enough, topic)
 
     def chunks() -> Iterator[PointCloud]:
         points = dropped = 0
@@ -86,9 +101,14 @@ def open_cloud(
             bad = int(len(finite) - finite.sum())
             if bad:
                 cloud = cloud.select(finite)
+            if box is not None:
+                inside = (cloud.points >= np.array(box[:3])) & (cloud.points <= np.array(box[3:]))
+                cloud = cloud.select(np.flatnonzero(inside.all(axis=1)))
             cloud.path, cloud.format, cloud.dropped = Path(path), form, cloud.dropped + bad
             points, dropped = points + len(cloud), dropped + bad
             yield cloud
+        if points == 0 and box is not None:
+            raise CloudFileError(f"{path}: has no points within the bounds, compare them with `fmr info`")
         if points == 0:
             what = f"none of its {dropped} points has finite coordinates" if dropped else "holds no points"
             raise CloudFileError(f"{path}: {what}, check how it was written")
@@ -104,6 +124,8 @@ def read_cloud(
     attributes: bool = True,
     at_most: int | None = None,
     bin_columns: tuple[str, ...] | None = None,
+    bounds: Sequence[float] | None = None,
+    resolution: float | None = None,
 ) -> PointCloud:
     """Reads a point cloud; points with NaN or infinite coordinates are dropped and counted in ``dropped``.
 
@@ -112,31 +134,72 @@ def read_cloud(
         least 10,000 and at most 1,000,000. 0 gives the vertices themselves. ``seed`` makes the sample repeatable.
     attributes: False leaves everything but the coordinates in the file, which saves time and memory.
     at_most: of more than twice as many points, at least so many are kept, spread evenly; ``total`` says how many there
-        are. The memory it takes then depends on this number only.
-    bin_columns: what the numbers of a .bin are, where their values do not tell.
+        are. The memory it takes then depends on this number only. Of a COPC only the coarse levels are read.
+    bin_columns: what the numbers of a .bin are, where their values do not tell: names, or "name:type" of numpy.
+    bounds: low x y z and high x y z, in the file's unit: only what lies within. Of a COPC nothing else is read.
+    resolution: of a COPC, the spacing of points that is enough, in the file's unit.
 
     Raises CloudFileError, one line that names the file, for whatever is wrong with it.
     """
-    cloud = collect(
-        open_cloud(path, mesh_points=mesh_points, seed=seed, attributes=attributes, bin_columns=bin_columns),
-        at_most,
-        seed,
-    )
-    return cloud
+    stream = open_cloud(
+        path, mesh_points=mesh_points, seed=seed, attributes=attributes, bin_columns=bin_columns, bounds=bounds,
+        resolution=resolution, enough=at_most,
+    )  # fmt: skip
+    return collect(stream, at_most, seed)
 
 
-def scans_of(path: str | Path) -> list[ScanPart]:
+def checked_bounds(bounds: Sequence[float] | None) -> tuple[float, ...] | None:
+    """Six numbers, low before high. Raises CloudFileError."""
+    if bounds is None:
+        return None
+    box = tuple(float(v) for v in bounds)
+    if len(box) != 6 or not all(low <= high for low, high in zip(box[:3], box[3:], strict=True)):
+        said = " ".join(f"{v:g}" for v in box)
+        raise CloudFileError(f"--bounds {said}: give low x y z and then high x y z, each low below its high")
+    return box
+
+
+def scans_of(path: str | Path, topic: str | None = None) -> list[ScanPart]:
     """The scans of a file with their names and poses; of most formats one, in the file's own frame.
 
-    Its name is then empty. Each but that is read by ``FILE#number``, numbers from 1. Raises CloudFileError.
+    Its name is then empty. Each but that is read by ``FILE#number``, numbers from 1, see ``scan_paths``. topic: of a
+    bag. Raises CloudFileError.
     """
     path = Path(path)
     module, _, file, part = find_module(path, SUFFIXES)
-    if module.__name__.rsplit(".", 1)[1] not in PARTED or part is not None:
+    topic = topic or topic_of(part)
+    if module.__name__.rsplit(".", 1)[1] not in PARTED or (part is not None and topic is None):
         return [ScanPart("", np.eye(4), 0)]
-    check_readable(file)
+    check_scan(path)
     with naming(file):
-        return module.scans(file)
+        return module.scans(file, topic) if topic is not None else module.scans(file)
+
+
+def scan_paths(path: str | Path, topic: str | None = None) -> list[Path]:
+    """What to read each scan of a file by: FILE#1, FILE#2, ... of a file that holds several, else the file itself."""
+    parts = scans_of(path, topic)
+    if len(parts) == 1 and not parts[0].name:
+        return [Path(path)]
+    _, _, file, part = find_module(Path(path), SUFFIXES)
+    topic = topic or topic_of(part)
+    return [file.with_name(f"{file.name}#{part_name(number, topic)}") for number in range(1, len(parts) + 1)]
+
+
+def holds_scans(path: str | Path) -> bool:
+    """Whether a path is a file of a kind that may hold several scans, and none of them: a bag, an E57, a PTX."""
+    try:
+        module, _, file, part = find_module(Path(path), SUFFIXES)
+    except CloudFileError:
+        return False
+    whole = part is None or topic_of(part) is not None
+    return whole and file.exists() and module.__name__.rsplit(".", 1)[1] in PARTED
+
+
+def check_scan(path: str | Path) -> None:
+    """Raises CloudFileError where the file of a scan, FILE or FILE#part, is not there or of no kind that is read."""
+    _, _, file, _ = find_module(Path(path), SUFFIXES)
+    if not is_bag_folder(file):
+        check_readable(file)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
@@ -196,7 +259,9 @@ def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str,
     part = None
     if "#" in path.name and suffixes is SUFFIXES and not path.exists():
         name, part = path.name.rsplit("#", 1)
-        path = path.with_name(name)
+        path = path.with_name(name) if name else path
+    if suffixes is SUFFIXES and is_bag_folder(path):
+        return importlib.import_module("fmr_cli.io.bags"), "bag", path, part
     packed = path.suffix.lower() == ".gz"
     suffix = path.with_suffix("").suffix.lower() if packed else path.suffix.lower()
     full = f"{suffix}.gz" if packed else suffix

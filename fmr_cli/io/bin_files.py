@@ -1,21 +1,22 @@
-""".bin: float32 numbers and nothing else, 3 to 8 of them a point (KITTI 4, nuScenes 5), or NCLT's 8 bytes a point.
+""".bin: numbers and nothing else. 3 to 8 float32 a point (KITTI 4, nuScenes 5), some of them uint32; float64; records
+with a 2-byte ring as drivers pack them; NCLT's 8 bytes a point.
 
 How many, and what they are, stands nowhere: it is told by the values, unless `Wanted.bin_columns` names them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io.fields import bare_names, lost_context
-from fmr_cli.io.stream import CHUNK, CloudStream, Wanted
+from fmr_cli.io.fields import are_colors, bare_names, lost_context, native
+from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted
 
-WIDTHS = range(3, 9)  # float32 a point
+WIDTHS = range(3, 9)  # numbers a point
 PERIOD = 840  # the least common multiple of the widths: samples that start at its multiples start with a point
 SAMPLES = 24  # of PERIOD numbers each, spread over the file
 BINS = 24
@@ -23,57 +24,141 @@ BINS = 24
 # since twice the width tells the columns apart as well. Columns of one kind tell less than UNCLEAR nats.
 NEARLY, UNCLEAR = 0.85, 0.02
 FEW = 600  # numbers, of which no distribution can be told: such a file is taken for KITTI's where it may be
-PLAUSIBLE = (1e-6, 1e7)  # sizes of a float32 that is a coordinate or an attribute; what is none has any exponent
+PLAUSIBLE = (1e-6, 1e7)  # sizes of a number that is a coordinate or an attribute; what is none has any exponent
+RINGS = 256  # lasers of a scanner
+# As drivers for ROS pack their points; numpy's types
+PACKED = (
+    ("x", "y", "z", "intensity", "ring:u2"),
+    ("x", "y", "z", "intensity", "ring:u2", "time"),
+    ("x", "y", "z", "intensity", "ring:u2", "time:f8"),
+)
 NCLT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("ring", "u1")])  # 5 mm steps from -100 m
 NCLT_STEP, NCLT_ORIGIN, NCLT_RINGS = 0.005, -100.0, 32
-HELP = "say what they are, such as --bin-columns x,y,z,intensity"
+HELP = "say what they are, such as --bin-columns x,y,z,intensity or, with numpy's types, x:f8,y:f8,z:f8,ring:u2"
 
 
 def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
     size = path.stat().st_size
-    sample = sample_of(path, size)
-    if wanted.bin_columns is None and not plausible(sample) and size % NCLT.itemsize == 0 and is_nclt(path):
-        yield from read_nclt(path, wanted.attributes)
-        return
-    names = list(wanted.bin_columns) if wanted.bin_columns else find_columns(sample, size)
-    if size % (4 * len(names)):
-        raise CloudFileError(f"holds {size} bytes, no multiple of {len(names)} float32 ({' '.join(names)}): {HELP}")
+    if wanted.bin_columns is None:
+        columns = find_columns(path, size)
+        if columns is None:
+            yield from read_nclt(path, wanted.attributes)
+            return
+    else:
+        columns = wanted.bin_columns
+    dtype = record_of(columns)
+    if size % dtype.itemsize:
+        raise CloudFileError(
+            f"holds {size} bytes, no multiple of the {dtype.itemsize} that a point takes ({' '.join(columns)}): {HELP}"
+        )
     layout = None
-    if wanted.bin_columns is None and names != ["x", "y", "z", "intensity"]:
-        layout = f"{len(names)} float32 a point, by their values {' '.join(names)}"
+    if wanted.bin_columns is None and columns != ("x", "y", "z", "intensity"):
+        layout = f"{dtype.itemsize} bytes a point, by their values {' '.join(columns)}"
     with path.open("rb") as file:
-        for _ in range(0, size // (4 * len(names)), CHUNK):
-            rows = np.fromfile(file, "<f4", CHUNK * len(names)).reshape(-1, len(names))
-            points = rows[:, [names.index(axis) for axis in "xyz"]]
-            kept = {n: rows[:, k].copy() for k, n in enumerate(names) if n not in "xyz"} if wanted.attributes else {}
+        for _ in range(0, size // dtype.itemsize, CHUNK):
+            rows = np.fromfile(file, dtype, CHUNK)
+            points = np.stack([rows[axis] for axis in "xyz"], 1)
+            names = [name for name in dtype.names or () if name not in "xyz"]
+            kept = {name: native(rows[name]) for name in names} if wanted.attributes else {}
             yield PointCloud(points, kept, sensor_origin=np.zeros(3), layout=layout)
 
 
-def sample_of(path: Path, size: int) -> np.ndarray:
-    """Numbers from all over the file, each run of them beginning with a point whatever the width: (n, PERIOD)."""
-    numbers = np.memmap(path, "<f4", "r", shape=size // 4) if size >= 4 else np.empty(0, "<f4")
+def record_of(columns: Iterable[str]) -> np.dtype:
+    """The record of columns "name" (float32) or "name:type" (numpy's name of the type, little endian)."""
+    given = [column.partition(":") for column in columns]
+    try:
+        return np.dtype([(name, np.dtype(kind or "f4").newbyteorder("<")) for name, _, kind in given])
+    except TypeError as error:
+        raise CloudFileError(
+            f"--bin-columns {','.join(columns)}: {error}; types are such as f4, f8, u1, u2, i4"
+        ) from None
+
+
+def find_columns(path: Path, size: int) -> tuple[str, ...] | None:
+    """What a point holds, told by the values; None for NCLT's records. Raises CloudFileError where nothing fits, or
+    two layouts do.
+    """
+    sample = sample_of(path, size, "<f4")
+    holes = np.isnan(sample).sum() > 0.1 * len(sample)  # colours with an alpha are NaN as float32
+    wholes = whole_numbers_among(sample, size) if holes or not plausible(sample) else []
+    if plausible(sample) and not wholes:
+        return columns_of(sample, size, "")
+    if size % NCLT.itemsize == 0 and is_nclt(path):
+        return None
+    found = [*wholes, *(c for c in PACKED if is_packed(path, size, c))]
+    if not found and size % 8 == 0 and plausible(doubles := sample_of(path, size, "<f8")):
+        return columns_of(doubles, size, ":f8")
+    if len(found) > 1:
+        choice = " or ".join(" ".join(columns) for columns in found)
+        raise CloudFileError(f"may hold {choice}, its values do not tell which: {HELP}")
+    if found:
+        return found[0]
+    with path.open("rb") as file:
+        head = file.read(1000)
+    if all(c in b"\t\r\n" or 32 <= c < 127 for c in head):
+        raise CloudFileError("is text: give it the suffix of what it is, such as .xyz")
+    raise CloudFileError(f"holds no float32 coordinates, nor another layout that is known: {HELP}")
+
+
+def whole_numbers_among(sample: np.ndarray, size: int) -> list[tuple[str, ...]]:
+    """Layouts of 4-byte numbers some of which are uint32: as float32 those would be tiny, huge or no number."""
+    found: list[tuple[str, ...]] = []
+    for width in WIDTHS:
+        if size % (4 * width) or any(width % len(columns) == 0 for columns in found):
+            continue
+        rows = sample[: len(sample) // width * width].reshape(-1, width)
+        whole = np.array([(~is_plausible(column)).mean() > 0.8 for column in rows.T])
+        floats = all(plausible(column) for column in rows.T[~whole])
+        if whole.any() and not whole[:3].any() and floats and (np.ptp(rows[:, :3], axis=0) > 0).all():
+            values = np.where(whole, np.ascontiguousarray(rows).view("<u4"), rows.astype(np.float64))
+            names = name_columns(values[:, 3:])
+            kinds = [":u4" if w else "" for w in whole[3:]]
+            found.append(("x", "y", "z", *(name + kind for name, kind in zip(names, kinds, strict=True))))
+    return found
+
+
+def is_packed(path: Path, size: int, columns: tuple[str, ...]) -> bool:
+    dtype = record_of(columns)
+    if size % dtype.itemsize:
+        return False
+    rows = np.fromfile(path, dtype, 10_000)
+    moves = all(np.ptp(rows[axis]) > 0 for axis in "xyz")
+    floats = all(plausible(rows[name]) for name in dtype.names or () if dtype[name].kind == "f")
+    return bool(floats and moves and rows["ring"].max() < RINGS)
+
+
+def sample_of(path: Path, size: int, kind: str) -> np.ndarray:
+    """Numbers from all over the file, each run of them beginning with a point whatever the width: (n,)."""
+    width = np.dtype(kind).itemsize
+    numbers = np.memmap(path, kind, "r", shape=size // width) if size >= width else np.empty(0, kind)
     runs = max(len(numbers) // PERIOD, 1)
     starts = np.unique(np.linspace(0, runs - 1, min(SAMPLES, runs), dtype=int)) * PERIOD
     return np.concatenate([numbers[start : start + PERIOD] for start in starts])
 
 
+def is_plausible(values: np.ndarray) -> np.ndarray:
+    """Which numbers may be those of a scan: neither huge nor tiny."""
+    magnitude = np.abs(values)
+    return (magnitude == 0) | ((magnitude > PLAUSIBLE[0]) & (magnitude < PLAUSIBLE[1]))
+
+
 def plausible(sample: np.ndarray) -> bool:
-    """Whether the numbers are float32 of a scan: neither huge nor tiny, but for a few."""
-    magnitude = np.abs(sample[np.isfinite(sample)])
-    inside = (magnitude == 0) | ((magnitude > PLAUSIBLE[0]) & (magnitude < PLAUSIBLE[1]))
-    return bool(inside.mean() > 0.98) if len(inside) else True
+    """Whether the numbers are those of a scan, but for a few; those that are not finite, of no return, do not count."""
+    finite = sample[np.isfinite(sample)]
+    return bool(is_plausible(finite).mean() > 0.98) if len(finite) else True
 
 
-def find_columns(sample: np.ndarray, size: int) -> list[str]:
-    """The columns' names, told by the values. Raises CloudFileError where nothing fits, or two widths do."""
-    fitting = [width for width in WIDTHS if size % (4 * width) == 0]
+def columns_of(sample: np.ndarray, size: int, kind: str) -> tuple[str, ...]:
+    """The columns of numbers of one type, told by the values. Raises CloudFileError where nothing fits, or two widths
+    do.
+    """
+    fitting = [width for width in WIDTHS if size % (sample.itemsize * width) == 0]
     if not fitting:
         raise CloudFileError(f"holds {size} bytes, which is no number of points of 3 to 8 float32: copy it again")
-    if not plausible(sample):
-        raise CloudFileError("holds no float32 coordinates, nor another layout that is known: write it as .ply or .npy")
     width = find_width(sample, fitting)
     rows = sample[: len(sample) // width * width].reshape(-1, width)
-    return ["x", "y", "z", *name_columns(rows[np.isfinite(rows).all(1), 3:])]
+    names = ["x", "y", "z", *name_columns(rows[np.isfinite(rows).all(1), 3:])]
+    return tuple(name + kind for name in names)
 
 
 def find_width(sample: np.ndarray, fitting: list[int]) -> int:
@@ -108,27 +193,42 @@ def column_information(sample: np.ndarray, width: int) -> float:
 
 
 def name_columns(extra: np.ndarray) -> list[str]:
-    """What the numbers after x y z are: an intensity first, small integers a ring, else times; colours, normals."""
-    names = bare_names(extra) if extra.shape[1] >= 3 else []
+    """What the numbers after x y z are: intensity first, small integers a ring, what rises a time; colours, normals."""
+    count = extra.shape[1]
+    names = bare_names(extra) if count >= 3 else []
     if names and not names[0].startswith("column_"):
         return names
-    names = []
+    if count > 3 and are_colors(extra[:, :3]) and (extra[:, :3].max(0) > 127).all():
+        return [*COLORS, *name_singly(extra[:, 3:], 7)]
+    if count == 3 and ((extra >= 0) & (extra <= 1)).all() and not any(map(rises, extra.T)):
+        return [*COLORS]
+    return name_singly(extra, 4)
+
+
+def name_singly(extra: np.ndarray, first: int) -> list[str]:
+    """Names of single columns, the first of which is the file's ``first``, from 1."""
+    names: list[str] = []
     for k, column in enumerate(extra.T):
         whole = bool(len(column) and (column == np.rint(column)).all() and column.min() >= 0)
         if k == 0:
             names.append("intensity")
-        elif whole and column.max() < 256 and "ring" not in names:
+        elif whole and column.max() < RINGS and "ring" not in names:
             names.append("ring")
-        elif k == extra.shape[1] - 1 and not whole and "time" not in names:
+        elif rises(column) and "time" not in names:
             names.append("time")
         else:
-            names.append(f"column_{4 + k}")
+            names.append(f"column_{first + k}")
     return names
+
+
+def rises(column: np.ndarray) -> bool:
+    """Whether values are those of a clock: nearly none is below the one before."""
+    return bool(len(column) > 1 and np.ptp(column) > 0 and (np.diff(column.astype(np.float64)) >= 0).mean() > 0.9)
 
 
 def is_nclt(path: Path) -> bool:
     head = np.fromfile(path, NCLT, 10_000)
-    return bool(head["ring"].max() < NCLT_RINGS and (np.ptp(head["xyz"].astype(int), axis=0) > 0).all())
+    return bool(len(head) and head["ring"].max() < NCLT_RINGS and (np.ptp(head["xyz"].astype(int), axis=0) > 0).all())
 
 
 def read_nclt(path: Path, attributes: bool) -> Iterator[PointCloud]:

@@ -15,7 +15,7 @@ import numpy as np
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import fields_of, lost_context, storable, unique
-from fmr_cli.io.parts import ScanPart, choose
+from fmr_cli.io.parts import ScanPart, choose, proper
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -222,7 +222,7 @@ class ScanSink:
         node.set("name", lib.StringNode(file, first.scan or ""))
         self.T_scan_file = np.eye(4)
         if first.T_file_scan is not None:
-            T = first.T_file_scan.copy()
+            T = proper(first.T_file_scan)
             T[:3, :3] /= np.cbrt(np.linalg.det(T[:3, :3]))  # a pose has no scale: the points keep it
             self.T_scan_file = np.linalg.inv(T)
             pose, rotation, translation = (lib.StructureNode(file) for _ in range(3))

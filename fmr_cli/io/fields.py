@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import BinaryIO
@@ -22,20 +23,30 @@ ALIASES = {
 }
 # How programs call the coordinates: as `plain` writes a name
 AXES = {
-    "x": ("x", "xcoord", "xcoordinate", "coordx", "posx", "positionx", "px", "pointx", "points0", "easting", "east",
-          "e", "ostwert", "rechtswert"),
-    "y": ("y", "ycoord", "ycoordinate", "coordy", "posy", "positiony", "py", "pointy", "points1", "northing", "north",
-          "n", "nordwert", "hochwert"),
-    "z": ("z", "zcoord", "zcoordinate", "coordz", "posz", "positionz", "pz", "pointz", "points2", "elevation", "elev",
-          "height", "altitude", "alt", "h", "hoehe", "up"),
+    "x": ("x", "xcoord", "xcoordinate", "coordx", "coordinatex", "posx", "positionx", "px", "pointx", "points0",
+          "pointsmxyz0", "pointsxyz0", "xyz0", "coordinates0", "position0", "easting", "eastings", "east", "e",
+          "ostwert", "rechtswert", "este", "est"),
+    "y": ("y", "ycoord", "ycoordinate", "coordy", "coordinatey", "posy", "positiony", "py", "pointy", "points1",
+          "pointsmxyz1", "pointsxyz1", "xyz1", "coordinates1", "position1", "northing", "northings", "north", "n",
+          "nordwert", "hochwert", "norte", "nord"),
+    "z": ("z", "zcoord", "zcoordinate", "coordz", "coordinatez", "posz", "positionz", "pz", "pointz", "points2",
+          "pointsmxyz2", "pointsxyz2", "xyz2", "coordinates2", "position2", "elevation", "elev", "height", "altitude",
+          "alt", "h", "hoehe", "hohe", "up", "cota", "quota", "hauteur"),
 }  # fmt: skip
 LONGITUDES, LATITUDES = {"lon", "long", "lng", "longitude"}, {"lat", "latitude"}
+# Whole vectors in one field of three
+TRIPLES = {
+    **dict.fromkeys(("xyz", "points", "point", "position", "positions", "pos", "coords", "coordinates"), "xyz"),
+    **dict.fromkeys(("normal", "normals", "n"), NORMALS),
+    **dict.fromkeys(("rgb", "color", "colors", "colour", "colours"), COLORS),
+}
 
 
 def plain(name: str) -> str:
     """A field's name without its unit, quotes and signs, in small letters: "X [m]", "x_coord", "Points:0"."""
-    name = re.sub(r"[\[({].*?[\])}]", "", name.lower()).strip().strip("#/\"'% ")
-    name = re.sub(r"(?<=[a-z])[ _](m|cm|mm|ft|km|metres?|meters?|feet)$", "", name)
+    name = "".join(c for c in unicodedata.normalize("NFKD", name.lower()) if not unicodedata.combining(c))
+    name = re.sub(r"[\[({].*?[\])}]", "", name).strip().strip("#/\"'% ")
+    name = re.sub(r"(?<=[a-z])[ _](m|cm|mm|ft|km|metres?|meters?|feet|deg|degrees?|dd)$", "", name)
     return re.sub(r"[^a-z0-9]", "", name)
 
 
@@ -89,6 +100,7 @@ def unified(names: list[str]) -> dict[str, str]:
 def to_cloud(columns: Mapping[str, np.ndarray], attributes: bool) -> PointCloud:
     """A cloud of columns of equal length, of which x, y and z must be among them (CloudFileError otherwise)."""
     refuse_degrees(columns)
+    columns = parted(columns)
     columns = {new: columns[old] for old, new in unified(list(columns)).items()}
     missing = [axis for axis in "xyz" if axis not in columns or columns[axis].ndim != 1]
     if missing:
@@ -100,9 +112,21 @@ def to_cloud(columns: Mapping[str, np.ndarray], attributes: bool) -> PointCloud:
     return PointCloud(points, kept)
 
 
+def parted(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    """Fields of three values that are coordinates, a normal or a colour as three fields; others as they are."""
+    result: dict[str, np.ndarray] = {}
+    for name, values in columns.items():
+        parts = TRIPLES.get(plain(name), ()) if values.ndim == 2 and values.shape[1] == 3 else ()
+        if not parts or {*parts} & {*columns}:
+            result[name] = values
+        else:
+            result |= dict(zip(parts, values.T, strict=True))
+    return result
+
+
 def native(values: np.ndarray) -> np.ndarray:
     """A contiguous copy in this machine's byte order."""
-    return np.array(values, dtype=values.dtype.newbyteorder("="))
+    return values.astype(values.dtype.newbyteorder("="))
 
 
 def bare_names(extra: np.ndarray) -> list[str]:

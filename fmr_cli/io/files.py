@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
+import socket
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from fmr_cli.errors import CloudFileError
+
+LEFTOVER = re.compile(r"(?P<host>\w+)-(?P<pid>[0-9]{1,9})-[0-9a-f]{8}\.tmp")  # of a temporary's name, its middle
+DAY = 86_400  # seconds
 
 
 def check_readable(path: Path) -> int:
@@ -42,8 +48,9 @@ def check_writable(path: Path) -> None:
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside ``path`` (same suffix); renames it on success, removes it on failure.
 
-    Devices and pipes (``/dev/stdout``) are written to directly. Raises CloudFileError where the folder is missing or
-    cannot be written to, and where writing fails.
+    Those that a process left behind when it was killed are removed by the next that writes the same file. Devices and
+    pipes (``/dev/stdout``) are written to directly. Raises CloudFileError where the folder is missing or cannot be
+    written to, and where writing fails.
     """
     path = Path(path)
     if path.exists() and not path.is_file() and not path.is_dir():
@@ -51,7 +58,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         return
     check_writable(path)
     final = path.resolve()  # a symbolic link stays one
-    temporary = final.with_name(f".{final.stem[:100]}.{secrets.token_hex(4)}.tmp{final.suffix}")
+    remove_leftovers(final)
+    temporary = final.with_name(f"{prefix_of(final)}{host()}-{os.getpid()}-{secrets.token_hex(4)}.tmp{final.suffix}")
     try:
         yield temporary
         os.replace(temporary, final)
@@ -59,6 +67,43 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         raise CloudFileError(f"{path}: cannot be written ({reason(error)})") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def prefix_of(final: Path) -> str:
+    """How the names of a file's temporaries begin."""
+    return f".{final.stem[:100]}."
+
+
+def host() -> str:
+    """This machine's name, as far as a file's name may have it."""
+    return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:30]
+
+
+def remove_leftovers(final: Path) -> None:
+    """Removes what processes that are no more have left of writing this file: of this machine's, or a day old."""
+    prefix = prefix_of(final)
+    for path in final.parent.iterdir():
+        if not path.name.startswith(prefix):
+            continue
+        found = LEFTOVER.fullmatch(path.name.removeprefix(prefix).removesuffix(final.suffix))
+        if found is None:
+            continue
+        with suppress(OSError):
+            here = found["host"] == host() and os.name == "posix"
+            dead = here and not is_running(int(found["pid"]))
+            if dead or time.time() - path.stat().st_mtime > DAY:
+                path.unlink()
+
+
+def is_running(pid: int) -> bool:
+    """Whether there is a process of that number (POSIX)."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        pass
+    return True
 
 
 def reason(error: BaseException) -> str:

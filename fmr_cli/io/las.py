@@ -18,6 +18,7 @@ from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
+from fmr_cli.io import copc
 from fmr_cli.io.fields import lost_context, unique
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Column, Survey, Wanted
 
@@ -69,7 +70,15 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
             own_intensity = any((d.name, d.description) == INTENSITY for d in header.point_format.extra_dimensions)
             crs = crs_of(header)
             done = 0
-            for chunk in reader.chunk_iterator(CHUNK):
+            chunks, expected = reader.chunk_iterator(CHUNK), header.point_count
+            info = copc.info_of(header)
+            if info is not None and (wanted.bounds or wanted.resolution or wanted.at_most):
+                cells = copc.wanted_cells(copc.cells_of(file, info, file.size), info, wanted)
+                chunks, expected = copc.records(file, header, cells, selection, LAZ_LIMIT), sum(c.count for c in cells)
+            elif wanted.resolution:
+                raise CloudFileError("has no levels, --resolution needs a COPC: make one with `untwine` or `pdal`")
+            total = header.point_count if wanted.at_most and expected < header.point_count else None
+            for chunk in chunks:
                 points = np.empty((len(chunk), 3))
                 for i, axis in enumerate("XYZ"):
                     points[:, i] = chunk[axis] * header.scales[i] + header.offsets[i]
@@ -77,9 +86,9 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
                 if own_intensity and names:
                     kept["intensity"] = kept.pop("Intensity")
                 done += len(chunk)
-                yield PointCloud(points, kept, crs=crs, las_header=header, left_out=tuple(left_out))
-            if done != header.point_count:
-                raise CloudFileError(f"promises {header.point_count} points and holds {done}: copy it again")
+                yield PointCloud(points, kept, crs=crs, las_header=header, left_out=tuple(left_out), total=total)
+            if done != expected:
+                raise CloudFileError(f"promises {expected} points and holds {done}: copy it again")
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # what lazrs raises on some damaged files is no Exception
             raise
@@ -162,11 +171,13 @@ def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
     table = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
     if sum(count for count, _ in table) < header.point_count:
         raise CloudFileError(f"promises {header.point_count} points and holds fewer, it is truncated: copy it again")
+    if sum(size for _, size in table) > file.size:
+        raise CloudFileError("has a damaged table of compressed chunks: copy it again")
     if max(count for count, _ in table) * header.point_format.size > max(SMALL, LAZ_LIMIT * file.size):
         raise CloudFileError("promises more points than its compressed data can hold, it is damaged: copy it again")
     start = header.offset_to_point_data + 8
     raw = sum(size for _, size in items) + 4  # a chunk begins with its first point as it is and a count
-    for _, size in table if layers else []:
+    for _, size in [chunk for chunk in table if chunk[0]] if layers else []:
         file.seek(start)
         head = file.read(raw + 4 * layers)
         if len(head) < raw + 4 * layers or len(head) + sum(struct.unpack_from(f"<{layers}I", head, raw)) > size:
@@ -260,6 +271,10 @@ def header_for(survey: Survey) -> tuple[laspy.LasHeader, list[str]]:
         header.generating_software = "fmr"
     else:
         header = cloud.las_header.copy()
+        if copc.info_of(header) is not None:
+            warnings.append("the octree of COPC is left out: it is plain LAZ, `untwine` or `pdal` make a COPC of it")
+            for records in (header.vlrs, header.evlrs or []):
+                records[:] = [r for r in records if r.user_id != "copc"]
         if header.version.minor < 2:  # laspy writes 1.1 and later; 1.2 is the same with colours
             header.version = laspy.header.Version(1, 2)
         if header.global_encoding.waveform_data_packets_internal:

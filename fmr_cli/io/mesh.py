@@ -114,6 +114,8 @@ def read_off(lines: Lines) -> Parsed:
     match = re.fullmatch(r"(ST)?(C)?(N)?OFF(\d*)", head[0], re.ASCII)
     if not match:
         raise CloudFileError("is not an OFF file (its first line is not 'OFF')")
+    if "BINARY" in head:
+        raise CloudFileError("is a binary OFF, which is not supported: write it as text, or as .ply")
     counts = [word for word in (match[4], *head[1:]) if word] or next(rows, [])
     if len(counts) < 2 or not all(c.isascii() and c.isdigit() for c in counts[:2]):
         raise CloudFileError(f"line {lines.number}: expected the numbers of vertices and faces")
@@ -124,10 +126,11 @@ def read_off(lines: Lines) -> Parsed:
         vertices.append(numbers(lines, row[:3], 3))
         if len(row) - skip in (3, 4):
             colors.append(numbers(lines, row[skip:], len(row) - skip))
-    faces, face_colors = [], []
+    faces, face_colors, more = [], [], False
     for first, *rest in islice(rows, promised[1]):
         corners = max(int(numbers(lines, [first], 1)[0]), 0)
         faces.append([int(n) for n in numbers(lines, rest[:corners], corners)])
+        more |= len(rest) > corners
         if len(rest) - corners in (3, 4):
             face_colors.append(numbers(lines, rest[corners:], len(rest) - corners))
     if (len(vertices), len(faces)) != promised:
@@ -137,7 +140,7 @@ def read_off(lines: Lines) -> Parsed:
         )
     left_out = ["normals of the vertices"] if match[3] else []
     left_out += ["texture coordinates"] if match[1] else []
-    if face_colors and (colors or len(face_colors) != len(faces)):
+    if more and (colors or len(face_colors) != len(faces)):
         left_out.append("colours of the faces")
     return Parsed(vertices, faces, colors, face_colors, tuple(left_out))
 
@@ -163,8 +166,8 @@ def read_obj(lines: Lines) -> Parsed:
 
 
 def read_text_stl(lines: Lines) -> Parsed:
-    vertices = [numbers(lines, words[1:4], 3) for words in words_of(lines) if words[0] == "vertex"]
-    if not vertices or len(vertices) % 3 or not lines.last.strip().startswith("endsolid"):
+    vertices = [numbers(lines, words[1:4], 3) for words in words_of(lines) if words[0].lower() == "vertex"]
+    if not vertices or len(vertices) % 3 or not lines.last.strip().lower().startswith("endsolid"):
         raise CloudFileError("is not a complete STL file, it is truncated or damaged: copy it again")
     return Parsed(vertices, np.arange(len(vertices)).reshape(-1, 3).tolist(), [], [])
 
@@ -176,7 +179,7 @@ def read_binary_stl(path: Path) -> Mesh | None:
         head = file.read(84)
         count = int.from_bytes(head[80:], "little")
         if size < 84 + 50 * count or len(head) < 84:
-            if head[:5] == b"solid":
+            if head[:5].lower() == b"solid":
                 return None
             raise CloudFileError(
                 f"promises {count} triangles and is too short for them, it is truncated: copy it again"

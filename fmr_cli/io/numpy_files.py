@@ -14,7 +14,16 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io.fields import bare_cloud, bare_names, coordinates, lost_context, native, refuse_degrees, to_cloud
+from fmr_cli.io.fields import (
+    bare_cloud,
+    bare_names,
+    coordinates,
+    lost_context,
+    native,
+    parted,
+    refuse_degrees,
+    to_cloud,
+)
 from fmr_cli.io.stream import CHUNK, CloudStream, Column, Wanted
 
 DEFLATE_LIMIT = 1100  # zip cannot shrink data more than this many times
@@ -22,8 +31,8 @@ OWN = ("points", "crs", "sensor_origin", "file")  # names an attribute in an NPZ
 # What others call the array of coordinates; the first that is there
 KEYS = ("points", "xyz", "pts", "pos", "positions", "coords", "coordinates", "vertices", "point_cloud", "pointcloud",
         "pcd", "pc", "cloud", "data", "arr_0")  # fmt: skip
-WIDEST = 64  # columns a point may have
-FEWEST_FLAT = 64  # points from which (3, N) is certainly not N columns of 3 points
+WIDEST = 16  # columns a point may have that have no names
+FEWEST = 10  # points of a cloud: an array of fewer rows and more columns holds the points side by side
 
 
 def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
@@ -48,9 +57,12 @@ def clouds_of(array: np.ndarray, attributes: bool) -> Iterator[PointCloud]:
             yield to_cloud({name: part[name] for name in array.dtype.names or ()}, attributes)
         return
     rows = as_rows(array)
+    layout = None if rows is array else f"an array of {array.shape}, taken for {len(rows)} points"
     names = bare_names(np.asarray(rows[: 1 << 16, 3:]))
     for start in range(0, max(len(rows), 1), CHUNK):
-        yield bare_cloud(np.asarray(rows[start : start + CHUNK]), names, attributes)
+        cloud = bare_cloud(np.asarray(rows[start : start + CHUNK]), names, attributes)
+        cloud.layout = layout
+        yield cloud
 
 
 def as_rows(array: np.ndarray) -> np.ndarray:
@@ -60,18 +72,20 @@ def as_rows(array: np.ndarray) -> np.ndarray:
         raise CloudFileError(f"holds an array of {array.dtype}, points need numbers")
     if len(shape) == 3 and shape[2] in (3, 4, 6, 7):
         return array.reshape(-1, shape[2])  # a range image, or a batch of clouds
+    if len(shape) == 3 and shape[0] == 3:
+        return array.reshape(3, -1).T
+    if shape == (4, 4) and np.array_equal(array[3], [0, 0, 0, 1]):
+        raise CloudFileError("holds a 4x4 transform and no points: give a cloud")
     if len(shape) != 2 or min(shape) < 3:
         raise CloudFileError(f"holds an array of {shape}, points need (N, 3) numbers or more columns")
     rows, columns = shape
-    if columns > WIDEST and rows <= 10:
+    if rows < FEWEST <= columns:
         return array.T
     if columns > WIDEST:
         raise CloudFileError(
             f"holds an array of {shape}: so many columns no point has, is it a depth image, or features? "
             "Give the points as (N, 3)"
         )
-    if rows == 3 and columns >= 10:
-        raise CloudFileError(f"holds an array of {shape}: 3 points, or {columns}? Give them as (N, 3)")
     return array
 
 
@@ -102,10 +116,8 @@ def read_npz(path: Path, attributes: bool) -> Iterator[PointCloud]:
             )
         others = [name for name in entries if name not in (key, *(axes or ()), "crs", "sensor_origin")]
         loaded = {name: load(name) for name in others} if attributes else {}
-        fitting = {
-            n: native(v) for n, v in loaded.items() if v.dtype.kind in "biuf" and v.ndim and len(v) == len(cloud)
-        }
-        cloud.attributes |= fitting
+        fitting = {n: v for n, v in loaded.items() if v.dtype.kind in "biuf" and v.ndim and len(v) == len(cloud)}
+        cloud.attributes |= {name: native(values) for name, values in parted(fitting).items()}
         cloud.left_out = tuple(f"array {name!r}" for name in loaded if name not in fitting)
         cloud.crs = str(load("crs")) if "crs" in entries else None
         if "sensor_origin" in entries:
@@ -118,6 +130,7 @@ def joined_up(clouds: list[PointCloud]) -> PointCloud:
     return PointCloud(
         np.concatenate([c.points for c in clouds]),
         {name: np.concatenate([c.attributes[name] for c in clouds]) for name in clouds[0].attributes},
+        layout=clouds[0].layout,
     )
 
 
@@ -126,7 +139,7 @@ def header_of(file: Any, size: int) -> tuple[tuple[int, ...], bool, np.dtype]:
     read_header = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(file)[0]
     if version not in read_header:
-        raise CloudFileError(f"is a .npy of version {version}, save it again with numpy.save")
+        raise CloudFileError(f"is a .npy of version {version}: give its fields ASCII names and save it again")
     shape, fortran, dtype = read_header[version](file)
     if dtype.hasobject:
         raise CloudFileError("holds Python objects, save an array of numbers")

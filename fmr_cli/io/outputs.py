@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import atomic_write, check_writable
 
-if TYPE_CHECKING:
-    pass
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how a cell begins that spreadsheets compute
 
 
 def check_outputs(outputs: Iterable[tuple[Path | None, Iterable[str]]]) -> None:
@@ -29,6 +28,17 @@ def check_outputs(outputs: Iterable[tuple[Path | None, Iterable[str]]]) -> None:
             raise CloudFileError(f"{path}: is given for two outputs, choose two names")
         seen.add(path.resolve())
         check_writable(path)
+
+
+def cell(value: Any) -> Any:
+    """A value as a cell of a CSV that spreadsheets take for no formula: text like =1+1 begins with an apostrophe."""
+    if not isinstance(value, str) or not value.startswith(FORMULA):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import struct
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from fmr_cli.io.table import Lines, read_rows
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"longlong": "i8", "ulonglong": "u8", "half": "f2", "float16": "f2"},
     **{"int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
 NAMES = {TYPES[name]: name for name in ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")}
@@ -79,10 +81,9 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
         text = None
         if not header.order:
             text = Lines(stack.enter_context(TextIOWrapper(file, "utf-8", errors="replace")), header.lines)
-        if text is None and faces is not None and names.index("face") < names.index("vertex"):
-            raise CloudFileError("has its faces before its vertices, write it again in the usual order")
         corners = None
         vertices: list[PointCloud] = []
+        colors: dict[str, np.ndarray] = {}
         for element in header.elements:
             check_length(element, text is None, size - (0 if text else file.tell()))
             if element.name == "vertex":
@@ -97,15 +98,17 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
                     return
             else:
                 columns = join_columns(columns_of(file, text, element, header.order, lists=element.name == "face"))
-                if element.name == "face":
+                if element is faces:
                     corners = columns.get("vertex_indices", columns.get("vertex_index"))
-                    break
+                    colors = {c: columns[c] for c in COLORS if c in columns}
+            if corners is not None and vertices:
+                break
         mesh = collect(vertices)
         if corners is None or len(corners) == 0:
             yield mesh
         else:
-            colors = {c: columns[c] for c in COLORS if c in columns and not {*COLORS} & {*mesh.attributes}}
-            yield Mesh(mesh, *fan(corners, colors if wanted.attributes else {}))
+            colors = {} if {*COLORS} & {*mesh.attributes} or not wanted.attributes else colors
+            yield Mesh(mesh, *fan(corners, colors))
 
 
 def context_of(header: Header) -> dict[str, Any]:
@@ -171,7 +174,7 @@ def header_lines(file: BinaryIO) -> Iterator[str]:
 
 
 def read_header(file: BinaryIO) -> Header:
-    if file.read(3) != b"ply":
+    if not file.read(6).removeprefix(codecs.BOM_UTF8).lower().startswith(b"ply"):
         raise CloudFileError("is not a PLY file (its first line is not 'ply')")
     order = None
     elements: list[Element] = []
@@ -185,7 +188,7 @@ def read_header(file: BinaryIO) -> Header:
             match [keyword, *words[1:]]:
                 case ["end_header", *_]:
                     break
-                case ["ply"] | [""]:
+                case ["ply" | "\ufeffply"] | [""]:
                     continue
                 case ["comment", ("crs" | "sensor_origin") as key, *_]:
                     comments[key] = line.split(maxsplit=2)[2] if len(words) > 2 else ""

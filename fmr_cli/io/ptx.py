@@ -10,7 +10,7 @@ import numpy as np
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import fields_of, lost_context
-from fmr_cli.io.parts import ScanPart, choose
+from fmr_cli.io.parts import ScanPart, choose, proper
 from fmr_cli.io.stream import COLORS, CloudStream, Wanted
 from fmr_cli.io.table import ROWS, Dialect, Lines, open_text, parse
 from fmr_cli.io.transforms import as_transform
@@ -112,7 +112,7 @@ def write(path: Path, stream: CloudStream) -> list[str]:
         started, last = 0, None
         for cloud in stream:
             if not started or cloud.scan != last:
-                T_file_scan = np.eye(4) if cloud.T_file_scan is None else cloud.T_file_scan
+                T_file_scan = proper(cloud.T_file_scan)
                 file.write(f"1\n{counts[started]}\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n")
                 file.writelines(" ".join(map(repr, row)) + "\n" for row in T_file_scan.T.tolist())
                 T_scan_file, started, last = np.linalg.inv(T_file_scan), started + 1, cloud.scan

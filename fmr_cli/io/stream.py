@@ -164,7 +164,7 @@ def collect(chunks: Iterable[PointCloud], at_most: int | None = None, seed: int 
     attributes = {name: joined([part.attributes.pop(name) for part in parts]) for name in [*parts[0].attributes]}
     points = joined([part.points for part in parts])
     cloud = replace(first, points=points, attributes=attributes, dropped=dropped)
-    cloud.total = total if len(cloud) < total else first.total
+    cloud.total = first.total or (total if len(cloud) < total else None)
     if cloud.format in UNTYPED and set(COLORS) & set(attributes):
         columns = {name: Column(v.dtype, v.shape[1:]) for name, v in attributes.items() if name in (*COLORS, "alpha")}
         for name, column in columns.items():
@@ -186,8 +186,16 @@ def one_of_each(count: int, stride: int, rng: np.random.Generator) -> np.ndarray
 
 @dataclass(frozen=True)
 class Wanted:
-    """What of a file is to be read. part: which scan of several, a number from 1 or a name. bin_columns: of a .bin."""
+    """What of a file is to be read. part: which scan of several, a number from 1 or a name. bin_columns: of a .bin.
+
+    bounds: low x y z and high x y z, file's unit; a reader that cannot seek may give more. resolution: of a COPC, the
+    spacing of points that is enough. at_most: so many points are enough, if spread evenly. topic: of a bag.
+    """
 
     attributes: bool = True
     part: str | None = None
     bin_columns: tuple[str, ...] | None = None
+    bounds: tuple[float, ...] | None = None
+    resolution: float | None = None
+    at_most: int | None = None
+    topic: str | None = None

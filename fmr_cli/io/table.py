@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
@@ -24,6 +25,8 @@ COMMENTS = ("#", "%", "//", ";", "!")
 # What programs write where there is no number
 MISSING = {"", "nan", "+nan", "-nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "?", "nan(ind)", "-nan(ind)",
            "1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind", "#num!", "*"}  # fmt: skip
+END_OF_FILE = "\x1a"  # of DOS
+MINUS = "\u2212"  # of typesetters
 INFINITE = {"1.#inf": np.inf, "-1.#inf": -np.inf}
 FORTRAN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[dD][+-]?\d+")
 # 1 234.5, 1'234.5; 1,234,567; 1,234.5; 1.234,5; 1.234.567
@@ -44,6 +47,10 @@ def open_text(path: Path) -> Iterator[TextIO]:
         binary: Any = BoundedGzip(raw, path.stat().st_size) if packed else raw
         head = binary.read(4096)
         binary.seek(0)
+        if packed:
+            while binary.read1(BLOCK):  # whether it is too large, before anything is made of it
+                pass
+            binary.seek(0)
         with io.TextIOWrapper(binary, encoding=encoding_of(head), errors="replace") as file:
             yield file
 
@@ -63,12 +70,18 @@ class BoundedGzip(gzip.GzipFile):
 
 
 def encoding_of(head: bytes) -> str:
+    if head.startswith((b"\xff\xfe\0\0", b"\0\0\xfe\xff")):
+        return "utf-32"
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     if len(head) > 8 and head[1::2].count(0) > 0.9 * (len(head) // 2):
         return "utf-16-le"
     if len(head) > 8 and head[::2].count(0) > 0.9 * (len(head) // 2):
         return "utf-16-be"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)  # its last letter may be cut
+    except UnicodeDecodeError:
+        return "cp1252"
     return "utf-8-sig"
 
 
@@ -96,7 +109,7 @@ class Lines:
     def __next__(self) -> str:
         for line in self.lines:
             self.number += 1
-            if line and not line.isspace():
+            if line and not line.isspace() and line != END_OF_FILE:
                 self.last = line
                 return line
         raise StopIteration
@@ -198,6 +211,9 @@ def parse_slowly(rows: Rows, dtype: np.dtype, dialect: Dialect) -> np.ndarray:
         except ValueError as error:
             if isinstance(error, CloudFileError):
                 raise
+            if "\0" in line:
+                what = "holds zero bytes, it was not written to its end: copy it again"
+                raise CloudFileError(f"line {number}: {what}") from None
             text = line.strip()[:60]
             bad = next((c.strip() for c in (cells[i] for i in dialect.used if i < len(cells))
                         if THOUSANDS.fullmatch(c.strip().strip('"'))), None)  # fmt: skip
@@ -212,7 +228,7 @@ def parse_slowly(rows: Rows, dtype: np.dtype, dialect: Dialect) -> np.ndarray:
 
 def number_in(cell: str) -> float:
     """The number in a cell, NaN for a word that says that there is none. Raises ValueError for any other text."""
-    text = cell.strip().strip("\"'").strip()
+    text = cell.strip().strip("\"'").strip().replace(MINUS, "-")
     try:
         if "_" not in text:  # Python's own mark between digits
             return float(text)

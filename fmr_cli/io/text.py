@@ -29,6 +29,7 @@ from fmr_cli.io.table import COMMENTS, ROWS, THOUSANDS, Dialect, Lines, Rows, nu
 HEAD = 200  # lines that are looked at to tell how the file is written
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 PTS = ("intensity", *COLORS)  # what a PTS line may hold after x y z, in that order
+PREAMBLE = 30  # lines before the names, at most
 SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
 
@@ -99,6 +100,7 @@ def find_table(head: Rows) -> Table:
         promised = int(head.lines.pop(0))
         head.numbers.pop(0)
     named: list[str] = []
+    skip_preamble(head)
     if head.lines and not any(map(is_number, first := names_in(head.lines[0]))):
         refuse_degrees(first)
         if not coordinates(first):
@@ -130,6 +132,19 @@ def find_table(head: Rows) -> Table:
     return use_numbers(head, dialect, unique(name or "unnamed" for name in named), promised)
 
 
+def skip_preamble(head: Rows) -> None:
+    """Takes out lines of words before the one that names the columns, as reports have them."""
+    if head.lines and head.lines[0].split()[0].lower() == "ncols":
+        raise CloudFileError("is an ESRI grid, a raster of heights and no points: gdal2xyz or QGIS make points of it")
+    for i, line in enumerate(head.lines[:PREAMBLE]):
+        words = names_in(line)
+        if sum(map(is_number, words)) >= 3:
+            return
+        if coordinates(words):
+            del head.lines[:i], head.numbers[:i]
+            return
+
+
 def use_numbers(head: Rows, dialect: Dialect, named: list[str], promised: int | None) -> Table:
     """Leaves columns of text out, and the points' own numbers where nothing says what the columns are."""
     cells = [row for row in map(dialect.cells, head.lines) if len(row) == dialect.columns]
@@ -155,7 +170,7 @@ def find_dialect(head: Rows) -> Dialect:
     lines = head.lines
     delimiter = next((d for d in ";|" if d in lines[0]), None)
     if delimiter is None and len({line.rstrip("\n").count("\t") for line in lines}) == 1 and "\t" in lines[0]:
-        delimiter = "\t"
+        delimiter = "\t" if not any(map(blanks_part, lines[0].split("\t"))) else None
     quoted = any('"' in line for line in lines)
     comma = delimiter is not None and any(DECIMAL_COMMA.fullmatch(c.strip(' "')) for c in lines[0].split(delimiter))
     if delimiter is None and "," in lines[0]:
@@ -172,7 +187,7 @@ def find_dialect(head: Rows) -> Dialect:
         raise CloudFileError(
             f"{marked!r} has marks between the thousands as well as decimals: export it again without them"
         )
-    if delimiter == "," and comma:
+    if delimiter == "," and (comma or decimals_between_commas(lines)):
         raise CloudFileError("has commas both as decimals and between the columns: export it with semicolons or points")
     trailing = delimiter is not None and all(line.rstrip().endswith(delimiter) for line in lines)
     dialect = Dialect(0, [], delimiter, comma, quoted, trailing)
@@ -183,6 +198,23 @@ def find_dialect(head: Rows) -> Dialect:
         dialect.columns = len(dialect.cells(lines[0]))
     dialect.used = list(range(dialect.columns))
     return dialect
+
+
+def blanks_part(cell: str) -> bool:
+    """Whether a cell between tabs holds several numbers between blanks."""
+    return len(cell.split()) > 1 and all(map(is_number, cell.split())) and not THOUSANDS.fullmatch(cell.strip())
+
+
+def decimals_between_commas(lines: list[str]) -> bool:
+    """Whether lines such as 101,870,-3,050 have decimal commas: every other cell is digits, some with a 0 first."""
+    cells = [[cell.strip() for cell in line.rstrip("\n").split(",")] for line in lines]
+    if any(len(row) < 6 or len(row) % 2 for row in cells):
+        return False
+    wholes, shares = [c for row in cells for c in row[::2]], [c for row in cells for c in row[1::2]]
+    return (
+        all(re.fullmatch(r"[+-]?\d+", c) for c in wholes) and all(c.isdecimal() for c in shares)
+        and any(len(c) > 1 and c[0] == "0" for c in shares)
+    )  # fmt: skip
 
 
 def names_in(line: str) -> list[str]:

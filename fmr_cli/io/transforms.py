@@ -18,12 +18,12 @@ LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 TOLERANCE = 1e-2  # other tools write as few as three digits
 
 
-def read_transform(path: str | Path) -> np.ndarray:
+def read_transform(path: str | Path, mirror: bool = False) -> np.ndarray:
     """The (4, 4) float64 transform of a .npy file, a .json file, or of text with 4x4, 3x4 or 1x12 numbers.
 
     JSON: four rows, or an object that has them under one of KEYS (such as the file of ``fmr align --metrics``).
     Raises CloudFileError where the shape is another, a number is not finite, the last row is not 0 0 0 1, or the 3x3
-    block is no rotation (times one scale).
+    block is no rotation (times one scale); with ``mirror`` it may also be a rotation and a mirror.
     """
     path = Path(path)
     check_readable(path)
@@ -35,7 +35,7 @@ def read_transform(path: str | Path) -> np.ndarray:
                 values = json_matrix(json.loads(path.read_text("utf-8")))
             case _:
                 values = np.array([number for row in number_rows(path) for number in row])
-        matrix = as_transform(np.array(values, dtype=np.float64)) if values.size in (12, 16) else None
+        matrix = as_transform(np.array(values, dtype=np.float64), mirror) if values.size in (12, 16) else None
     except CloudFileError as error:
         raise CloudFileError(f"{path}: {error}") from error
     except Exception as error:
@@ -54,8 +54,8 @@ def json_matrix(data: Any) -> np.ndarray:
     return np.array(data, dtype=np.float64)
 
 
-def as_transform(values: np.ndarray) -> np.ndarray:
-    """12 or 16 numbers, row by row, as a checked (4, 4) transform."""
+def as_transform(values: np.ndarray, mirror: bool = False) -> np.ndarray:
+    """12 or 16 numbers, row by row, as a checked (4, 4) transform; with ``mirror`` one that mirrors may be."""
     matrix = np.vstack([values.reshape(3, 4), LAST_ROW]) if values.size == 12 else values.reshape(4, 4)
     if not np.isfinite(matrix).all():
         raise CloudFileError("has numbers that are not finite, it is no transform")
@@ -63,7 +63,7 @@ def as_transform(values: np.ndarray) -> np.ndarray:
         raise CloudFileError("its last row is not 0 0 0 1, it is no transform (written column by column?)")
     block = matrix[:3, :3]
     scale = np.cbrt(np.linalg.det(block))
-    if not scale > 0 or np.abs(block @ block.T / scale**2 - np.eye(3)).max() > TOLERANCE:
+    if scale == 0 or (scale < 0 and not mirror) or np.abs(block @ block.T / scale**2 - np.eye(3)).max() > TOLERANCE:
         raise CloudFileError("its 3x3 block is no rotation (times one scale), it would shear or mirror the points")
     return matrix
 

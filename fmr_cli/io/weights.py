@@ -1,40 +1,55 @@
-"""The encoder's weights in a file: safetensors, the architecture in its metadata. Without torch."""
+"""All that a registration has learnt, in one file: safetensors, what is no tensor in its metadata. Without torch.
+
+``encoder.*``: the encoder of whole clouds, its architecture in the metadata; ``decoder.*``: that of its training;
+``local.*``: the encoder of local patches; ``verdict`` (metadata, JSON): what ``models/verdict.json`` holds. A file may
+hold any of these; what it lacks is the bundled one's.
+"""
 
 from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fmr_cli.errors import ModelError
 
+BARE = ("point.", "head.")  # names of the local encoder in a file of its own, as ``models/local.safetensors`` is
+
 
 @dataclass
 class Weights:
-    """hidden: the hidden layers' widths; layers: the hidden ones and the last, K wide.
+    """hidden: the widths of the global encoder's hidden layers; layers: the hidden ones and the last, K wide.
 
-    decoder: the decoder's arrays by name, empty where the file holds none.
+    Without a global encoder, layers is empty and feature_dim 0. decoder, local: arrays by name, empty where the file
+    holds none. verdict: the calibration, None where the file has none.
     """
 
-    hidden: tuple[int, ...]
-    feature_dim: int
-    layers: list[tuple[np.ndarray, np.ndarray]]
-    decoder: dict[str, np.ndarray]
+    hidden: tuple[int, ...] = ()
+    feature_dim: int = 0
+    layers: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    decoder: dict[str, np.ndarray] = field(default_factory=dict)
+    local: dict[str, np.ndarray] = field(default_factory=dict)
+    verdict: dict[str, Any] | None = None
 
 
 def weights_bytes(weights: Weights) -> bytes:
-    """Encoder and decoder as a file; ``read_weights`` reads them back bit for bit."""
+    """The weights as a file; ``read_weights`` reads them back bit for bit."""
     from safetensors.numpy import save
 
     arrays = {f"decoder.{name}": array for name, array in weights.decoder.items()}
+    arrays |= {f"local.{name}": array for name, array in weights.local.items()}
     for i, (W, b) in enumerate(weights.layers):
         arrays |= {f"encoder.layers.{i}.weight": W, f"encoder.layers.{i}.bias": b}
-    architecture = {"hidden": list(weights.hidden), "feature_dim": weights.feature_dim}
-    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    return save(arrays, metadata={"architecture": json.dumps(architecture)})
+    metadata = {}
+    if weights.layers:
+        metadata["architecture"] = json.dumps({"hidden": list(weights.hidden), "feature_dim": weights.feature_dim})
+    if weights.verdict is not None:
+        metadata["verdict"] = json.dumps(weights.verdict)
+    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata=metadata)
 
 
 def read_weights(path: Path | str) -> Weights:
@@ -51,6 +66,10 @@ def read_weights(path: Path | str) -> Weights:
     except (SafetensorError, TypeError) as error:  # TypeError: a number format that numpy does not have
         raise ModelError(f"{path}: not a safetensors file ({error}); give one written by `fmr train`") from None
     try:
+        local = part(arrays, "local.") or {name: array for name, array in arrays.items() if name.startswith(BARE)}
+        verdict = json.loads(metadata["verdict"]) if "verdict" in metadata else None
+        if local and "architecture" not in metadata:
+            return Weights(local=local, verdict=verdict)
         architecture = json.loads(metadata["architecture"])
         hidden, feature_dim = tuple(int(w) for w in architecture["hidden"]), int(architecture["feature_dim"])
         layers = [
@@ -64,8 +83,12 @@ def read_weights(path: Path | str) -> Weights:
         raise ModelError(
             f"{path}: the weights do not fit the encoder ({reason}); use one written by `fmr train`"
         ) from None
-    decoder = {k.removeprefix("decoder."): v for k, v in arrays.items() if k.startswith("decoder.")}
-    return Weights(hidden, feature_dim, layers, decoder)
+    return Weights(hidden, feature_dim, layers, part(arrays, "decoder."), local, verdict)
+
+
+def part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def shaped(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -16,7 +16,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.io import atomic_write, read_cloud, write_cloud, write_transform
-from fmr_cli.io.outputs import write_json
+from fmr_cli.io.outputs import cell, write_json
 from fmr_cli.io.stream import collect
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Network
@@ -72,7 +72,7 @@ def write_table(path: Path, columns: Sequence[str], rows: list[dict[str, Any]]) 
     with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, columns, lineterminator="\n")
         table.writeheader()
-        table.writerows(rows)
+        table.writerows({name: cell(value) for name, value in row.items()} for row in rows)
 
 
 def g2o(network: Network) -> Iterator[str]:

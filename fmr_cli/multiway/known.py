@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fmr_cli.errors import CloudFileError, FmrError
-from fmr_cli.io import read_transform
+from fmr_cli.io import read_transform, scans_of
 from fmr_cli.io.files import check_readable, reason
 from fmr_cli.io.transforms import as_transform
 from fmr_cli.multiway.scans import Scan
@@ -152,3 +152,18 @@ def number_of(name: str, scans: Sequence[Scan], option: str) -> int:
         some = ", ".join(scan.name for scan in scans[:5])
         raise FmrError(f"{option}: no scan is called {name}; they are {some}{' ...' if len(scans) > 5 else ''}")
     return number
+
+
+def poses_in_file(paths: Sequence[Path | None]) -> dict[int, KnownPose]:
+    """By place, the known poses of scans that all come from one file which states where each stood.
+
+    Their points are in the file's frame already, so that each pose is the identity, with the usual sigmas.
+    """
+    names = [path.name.partition("#") for path in paths if path is not None]
+    if len(names) < len(paths) or len({name for name, _, _ in names}) > 1 or not all(part for _, _, part in names):
+        return {}
+    first = next(path for path in paths if path is not None)
+    stated = scans_of(first.with_name(names[0][0])) if ":" not in names[0][2] else []
+    if all(np.array_equal(part.T_file_scan, stated[0].T_file_scan) for part in stated):
+        return {}
+    return {number: KnownPose(np.eye(4), None, None) for number in range(len(paths))}

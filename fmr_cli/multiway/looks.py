@@ -14,10 +14,10 @@ from scipy.cluster.vq import kmeans2, vq
 from scipy.spatial import cKDTree
 
 from fmr_cli.descriptors.consensus import consensus
+from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.multiway.directions import main_directions, turned
-from fmr_cli.registration.models import bundled_local_encoder
 from fmr_cli.registration.prepared import LARGEST_RATIO, Prepared
 
 KEYPOINTS = 500
@@ -59,9 +59,9 @@ class Look:
     others: tuple[Look, ...] = ()
 
 
-def describe(scan: Prepared, edge: float) -> Description:
+def describe(scan: Prepared, edge: float, encoder: LocalEncoder) -> Description:
     """The scan on a grid of ``edge``."""
-    keypoints, descriptors = scan.described(edge, KEYPOINTS, bundled_local_encoder())
+    keypoints, descriptors = scan.described(edge, KEYPOINTS, encoder)
     surface = scan.surface(edge)
     points = surface.points
     some = sample(np.arange(len(points)), SAMPLE, np.random.default_rng(scan.seed))

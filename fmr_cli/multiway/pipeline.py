@@ -21,8 +21,9 @@ from fmr_cli.multiway.registering import take_known_links
 from fmr_cli.multiway.rounds import confirm, join_components, register_most_promising, try_dear_starts
 from fmr_cli.multiway.scans import list_scans
 from fmr_cli.multiway.survey import Progress, Survey
-from fmr_cli.multiway.workers import Workers
+from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import Options
+from fmr_cli.workers import Workers
 
 
 def align_many(
@@ -32,7 +33,7 @@ def align_many(
     known: Known = Known(),
     out: Path | None = None,
     resume: bool = False,
-    workers: int | None = None,
+    workers: int | Workers | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Network:
     """Finds a pose for each of many scans, in any order, and says which links between them hold.
@@ -40,13 +41,14 @@ def align_many(
     scans: files, folders, text files that list scans, or clouds in memory; one unit. options: how pairs are registered;
     ``max_shift``: how far a scan's centre may move against another one, from its file's or its known pose. out: folder
     of the journal, so that a killed run can go on with ``resume``; None keeps nothing on disk. workers: pairs at a
-    time (default: the cores); the result does not depend on it.
+    time (default: the cores), or ``fmr_cli.workers.DaskWorkers``, entered, which register the pairs; the result does
+    not depend on it.
 
     Raises FmrError where there are fewer than two scans, a name is unknown, or GTSAM is missing; a scan that cannot be
     read, or a pair that cannot be registered, is a row that says so.
     """
     pose_graph.check_installed("fmr multiway")
-    survey = Survey(list_scans(scans, out), options, known, out, Workers(workers), progress)
+    survey = Survey(list_scans(scans, out), options, known, out, Threads(workers), progress)
     with at_work(survey, resume):
         prepare(survey)
         take_known_links(survey)

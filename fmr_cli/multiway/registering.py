@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,11 @@ from fmr_cli.multiway import consistency, pose_graph
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.links import Hypothesis, Link, best_of, key_of
 from fmr_cli.multiway.looks import best_of as best_look
+from fmr_cli.multiway.scans import Scan
 from fmr_cli.multiway.store import Store
 from fmr_cli.multiway.survey import Survey, ends_of
 from fmr_cli.registration import Options, align
+from fmr_cli.workers.base import LostError, check_there, kept
 
 
 @dataclass(frozen=True)
@@ -70,15 +73,56 @@ def register(store: Store, task: Attempt) -> Link:
         return Link(source, target, "failed", start, message=f"{type(error).__name__}: {reason(error)}")
 
 
+@dataclass(frozen=True)
+class Errand:
+    """An attempt with all that a worker in another process needs to know.
+
+    run: a name for what such a worker keeps for the run. scans, edges: of the two scans, by number. there: files that
+    the worker has to see.
+    """
+
+    run: str
+    seed: int
+    scans: dict[int, Scan]
+    edges: dict[int, float]
+    there: tuple[Path, ...]
+    attempt: Attempt
+
+
+def errand(survey: Survey, task: Attempt) -> Errand:
+    """An attempt for a worker in another process."""
+    ends = (task.source, task.target)
+    scans = {n: survey.scans[n] for n in ends}
+    scans = {n: replace(s, source=s.source.absolute()) if isinstance(s.source, Path) else s for n, s in scans.items()}
+    there = tuple(s.source for s in scans.values() if isinstance(s.source, Path) and s.source.is_file())
+    return Errand(survey.name, survey.options.seed, scans, {n: survey.edges[n] for n in ends}, there, task)
+
+
+def run_errand(task: Errand) -> Link:
+    """In another process: ``register``. Raises UnfitError where a file is not there."""
+    check_there(task.there)
+    store = kept(f"multiway {task.run}", lambda: Store({}, task.seed, None))
+    store.scans.update(task.scans)
+    store.edges.update(task.edges)
+    return register(store, task.attempt)
+
+
 def register_all(survey: Survey, attempts: list[Attempt]) -> None:
     """Registers pairs, or recalls what the journal has of them, and brings the components up to date."""
     known = {task.key: survey.journal.recall(task.key) for task in attempts}
     new = [task for task in attempts if known[task.key] is None]
+
+    def arrived(number: int, found: Link | LostError) -> None:
+        task = new[number]
+        if isinstance(found, LostError):
+            found = Link(task.source, task.target, "failed", task.start, message=str(found))
+        known[task.key] = survey.journal.keep(task.key, found)
+
     with survey.stage("register"):
-        survey.each(
-            "registering", partial(register, survey.store), new,
-            lambda n, link: known.update({new[n].key: survey.journal.keep(new[n].key, link)}),
-        )  # fmt: skip
+        if survey.workers.cluster:
+            survey.each("registering", run_errand, [errand(survey, task) for task in new], arrived, handed_out=True)
+        else:
+            survey.each("registering", partial(register, survey.store), new, arrived)
     for task in attempts:
         link = known[task.key]
         assert link is not None

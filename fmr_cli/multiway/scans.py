@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,8 +10,10 @@ from pathlib import Path
 from fmr_cli.batch.manifest import numbered, safe
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
+from fmr_cli.io import check_scan, holds_scans, scan_paths
 from fmr_cli.io.files import check_readable
-from fmr_cli.io.folders import find_scans
+from fmr_cli.io.folders import find_scans, natural
+from fmr_cli.io.parts import label_of
 
 LISTS = (".lst", ".list")  # and a .txt whose first line names a file
 
@@ -41,14 +42,16 @@ def list_scans(given: Iterable[str | Path | PointCloud], out: Path | None = None
             sources.append(item)
             continue
         path = Path(item)
-        if path.is_dir():
+        if holds_scans(path):
+            sources += scan_paths(path)
+        elif path.is_dir():
             sources += [
                 file for file in find_scans([path]) if out is None or out.resolve() not in file.resolve().parents
             ]
         elif is_list(path):
             sources += in_list(path)
         else:
-            check_readable(path)
+            check_scan(path)
             sources.append(path)
     if len(sources) < 2:
         where = ", ".join(str(item) for item in given if not isinstance(item, PointCloud)) or "the list of clouds"
@@ -85,23 +88,17 @@ def in_list(path: Path) -> list[Path]:
 def names(sources: Sequence[Path | PointCloud]) -> list[str]:
     """A name for each: its stem, with as many of its folders (then its suffix) as tell equal ones apart."""
     paths = [source if isinstance(source, Path) else source.path for source in sources]
-    found = [path.stem if path else f"cloud_{number:03d}" for number, path in enumerate(paths)]
+    found = [label_of(path) if path else f"cloud_{number:03d}" for number, path in enumerate(paths)]
     for depth in (1, 2, 3):
         files = {(name.casefold(), path.resolve() if path else None) for name, path in zip(found, paths, strict=True)}
         count = Counter(name for name, _ in files)  # one file given twice is no reason to call it by its folder
         for number, path in enumerate(paths):
             if path and count[found[number].casefold()] > 1:
                 folders = path.resolve().parent.parts[-depth:]
-                found[number] = "_".join([*folders, path.stem if depth < 3 else path.name])
+                found[number] = "_".join([*folders, label_of(path) if depth < 3 else path.name])
     taken: set[str] = set()
     unique = []
     for name in map(safe, found):
         unique.append(next(free for free in numbered(name) if free.casefold() not in taken))
         taken.add(unique[-1].casefold())
     return unique
-
-
-def natural(name: str) -> list[tuple[int, int, str]]:
-    """A key that puts scan2 before scan10."""
-    return [(0, int(part), "") if part.isdecimal() and part.isascii() else (1, 0, part.casefold())
-            for part in re.split(r"([0-9]+)", name) if part]  # fmt: skip

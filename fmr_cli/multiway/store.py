@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from concurrent.futures import Future
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,15 +28,11 @@ class Store:
     edges: the voxel edge of each scan's grid, shared by scans of like size so that each is described once (``looks``).
     """
 
-    def __init__(self, scans: list[Scan], seed: int, spill: Path | None) -> None:
+    def __init__(self, scans: Sequence[Scan] | dict[int, Scan], seed: int, spill: Path | None) -> None:
         self.scans, self.seed, self.spill = scans, seed, spill
         self.edges: dict[int, float] = {}
         self.kept: OrderedDict[int, Future[Prepared]] = OrderedDict()
         self.lock = threading.Lock()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Goes to another process as what it was made from; there, all tasks of a run share one."""
-        return shared_store, (tuple(self.scans), self.seed, self.spill, tuple(self.edges.items()))
 
     def prepared(self, number: int) -> Prepared:
         """A scan made ready, on its shared grid where that is known. Raises FmrError where it cannot be."""
@@ -92,11 +87,3 @@ class Store:
                 if held > CACHED_POINTS:
                     held -= len(r.points)
                     del self.kept[number]
-
-
-@lru_cache(1)
-def shared_store(scans: tuple[Scan, ...], seed: int, spill: Path | None, edges: tuple[tuple[int, float], ...]) -> Store:
-    """The store that this process keeps for all tasks of one run."""
-    store = Store(list(scans), seed, spill)
-    store.edges = dict(edges)
-    return store

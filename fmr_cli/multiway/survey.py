@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -18,13 +19,14 @@ from fmr_cli.geometry.frames import Frame, enter_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.multiway import consistency, looks, visibility
 from fmr_cli.multiway.consistency import Component, Join
-from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of
+from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of, poses_in_file
 from fmr_cli.multiway.links import Journal, Link
 from fmr_cli.multiway.pose_graph import Prior
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.multiway.store import Store
-from fmr_cli.multiway.workers import Workers
+from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import Options
+from fmr_cli.registration.models import local_encoder
 from fmr_cli.registration.prepared import pair_edge
 from fmr_cli.registration.result import plain
 
@@ -61,11 +63,12 @@ class Survey:
         options: Options,
         known: Known,
         out: Path | None,
-        workers: Workers,
+        workers: Threads,
         progress: Callable[[Progress], None] | None,
     ) -> None:
         self.scans, self.options, self.known, self.out = scans, options, known, out
         self.workers, self.report = workers, progress or (lambda _: None)
+        self.name = uuid.uuid4().hex  # of this run, for what workers elsewhere keep
         self.seconds: dict[str, float] = {}
         self.messages: dict[int, str] = {}
         self.failed: set[int] = set()
@@ -85,7 +88,10 @@ class Survey:
         self.journal = Journal(None if out is None else out / "journal.jsonl", self.settings())
         self.fixed_numbers = [number_of(name, scans, "--fixed") for name in dict.fromkeys(known.fixed)]
         self.anchor = None if known.anchor is None else number_of(known.anchor, scans, "--anchor")
-        self.poses = {number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()}
+        self.local = local_encoder(options.model)
+        self.poses = poses_in_file([scan.path for scan in scans]) | {
+            number_of(name, scans, "--init-poses"): pose for name, pose in known.poses.items()
+        }
         self.never: set[Ends] = set()
         self.asked: list[tuple[int, int, np.ndarray | None]] = []  # "try" and "known" links: source, target, pose
         self.given: list[tuple[int, int, np.ndarray]] = []
@@ -123,8 +129,12 @@ class Survey:
         work: Callable[[Any], Any],
         items: Sequence[Any],
         arrived: Callable[[int, Any], None] = lambda number, result: None,
+        handed_out: bool = False,
     ) -> list[Any]:
-        """The results of ``work`` on all items, in their order, by all workers; progress is reported as they come."""
+        """The results of ``work`` on all items, in their order, by all workers; progress is reported as they come.
+
+        handed_out: by the cluster's workers.
+        """
         aligned = sum(link.status == "aligned" for link in self.links.values())
         done = 0
 
@@ -134,7 +144,7 @@ class Survey:
             arrived(number, result)
             self.report(Progress(stage, done, len(items), aligned, len(self.components)))
 
-        return self.workers.map(work, items, one)
+        return (self.workers.hand_out if handed_out else self.workers.map)(work, items, one)
 
     # A scan.
 
@@ -146,7 +156,7 @@ class Survey:
         """What a look needs of a scan, on its own shared grid or one of ``edge``."""
         edge = edge or self.edges[number]
         if (number, edge) not in self.described:
-            self.described[number, edge] = looks.describe(self.store.prepared(number), edge)
+            self.described[number, edge] = looks.describe(self.store.prepared(number), edge, self.local)
         return self.described[number, edge]
 
     def moment(self, number: int) -> np.ndarray:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
 from typing import TypeVar
 
 from fmr_cli.cores import usable_cores
+from fmr_cli.workers import Workers
+from fmr_cli.workers.base import LostError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -16,15 +19,15 @@ def nothing(number: int, result: object) -> None:
     """What is done with a result that nobody waits for."""
 
 
-class Workers:
-    """Threads of this process; numpy and small_gicp let them run side by side.
+class Threads:
+    """Threads of this process, and where there are some, workers beyond it (``cluster``), which register the pairs.
 
-    Whatever takes its place (other machines) needs ``map`` and ``close`` alone. Pairs that are registered go through
-    ``map`` as picklable tasks with a picklable function (``registering.register``).
+    numpy and small_gicp let threads run side by side.
     """
 
-    def __init__(self, count: int | None = None) -> None:
-        self.pool = ThreadPoolExecutor(count or usable_cores())
+    def __init__(self, workers: int | Workers | None = None) -> None:
+        self.cluster = None if workers is None or isinstance(workers, int) else workers
+        self.pool = ThreadPoolExecutor(workers if isinstance(workers, int) else usable_cores())
 
     def map(
         self,
@@ -40,6 +43,21 @@ class Workers:
         for future in as_completed(futures):
             arrived(futures[future], future.result())
         return [future.result() for future in futures]
+
+    def hand_out(
+        self,
+        function: Callable[[Item], Result],
+        tasks: Sequence[Item],
+        arrived: Callable[[int, Result | LostError], None] = nothing,
+    ) -> list[Result | LostError]:
+        """As ``map``, by the cluster: function and tasks are small, and are pickled."""
+        assert self.cluster
+        results = []
+        with closing(self.cluster.run(function, tasks)) as answers:
+            for number, answer in enumerate(answers):
+                arrived(number, answer)
+                results.append(answer)
+        return results
 
     def close(self) -> None:
         """Ends the workers; what has not begun is not done any more."""

@@ -13,16 +13,19 @@ on made-up scans that no test uses.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.geometry.observability import direction
 from fmr_cli.registration.agreement import Agreement, agreement
+from fmr_cli.registration.models import model
 from fmr_cli.registration.pair import Pair
 
 ALIGNED = 0.7  # confidence from which a pose is called aligned
@@ -89,8 +92,22 @@ class Weights:
 @cache
 def bundled_weights() -> Weights:
     """Those of ``models/verdict.json``."""
-    given = json.loads((files("fmr_cli.models") / "verdict.json").read_text("utf-8"))
-    return Weights(*(np.array(given[name]) for name in ("support", "fit", "mean", "std", "verdict")))
+    return as_weights(json.loads((files("fmr_cli.models") / "verdict.json").read_text("utf-8")))
+
+
+def as_weights(given: Mapping[str, Any]) -> Weights:
+    """Those of a JSON object. Raises KeyError where it lacks some."""
+    return Weights(**{f.name: np.array(given[f.name]) for f in fields(Weights)})
+
+
+def weights_of(path: Path | None) -> Weights:
+    """Those that a model brings along, else the bundled ones; also where its own are of another version's evidence."""
+    given, bundled = model(path).verdict, bundled_weights()
+    own = None if given is None or not {f.name for f in fields(Weights)} <= given.keys() else as_weights(given)
+    same = own is not None and all(
+        getattr(own, f.name).shape == getattr(bundled, f.name).shape for f in fields(Weights)
+    )
+    return own if own is not None and same else bundled
 
 
 def sigmoid(logit: np.ndarray) -> np.ndarray:
@@ -165,7 +182,10 @@ class Judge:
     pair: Pair
     repeats: float = 0.0
     candidates: list[Candidate] = field(default_factory=list)
-    weights: Weights = field(default_factory=bundled_weights)
+    weights: Weights = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.weights = weights_of(self.pair.options.model)
 
     def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:
         """Gather the evidence at a pose, and weigh all candidates anew."""

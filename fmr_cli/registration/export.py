@@ -141,7 +141,8 @@ def metrics(source: PointCloud, target: PointCloud, found: Registration) -> dict
 
 def summary(source: PointCloud, target: PointCloud, found: Registration) -> list[str]:
     """One line for a person, and one for each thing that should not go unnoticed."""
-    scale = f"scale {found.scale:.6g}, " if found.options.scale else ""
+    scale = f"scale {found.scale:.6g}, " if found.options.scale or found.options.unit else ""
+    scale += "mirrored, " if found.mirrored else ""
     lines = [
         f"{found.status} (confidence {found.confidence:.2f}): rotation {found.angle:.4g} deg, shift {found.shift:.6g}, "
         f"{scale}overlap {found.overlap:.0%}, RMSE {found.inlier_rmse:.3g}, {found.seconds['total']:.2f} s"

@@ -6,16 +6,17 @@ Registration on the CPU works in numpy: to import torch takes longer than to reg
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from functools import lru_cache
+from dataclasses import replace
+from functools import cached_property, lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.errors import ModelError
 from fmr_cli.feature_metric.numpy_solver import NumpySolver
 from fmr_cli.feature_metric.search import Solver
-from fmr_cli.io.weights import read_weights
+from fmr_cli.io.weights import Weights, read_weights
 
 if TYPE_CHECKING:
     import torch
@@ -36,39 +37,101 @@ def pick_device(device: Device = "auto") -> torch.device:
     return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+class Model:
+    """All that a registration has learnt, each part made on first use; what ``weights`` lack is the bundled one's.
+
+    name: of the file, for messages.
+    """
+
+    def __init__(self, weights: Weights, name: str) -> None:
+        self.weights, self.name = weights, name
+
+    @cached_property
+    def whole(self) -> NumpySolver:
+        """The encoder of whole clouds and its solver, without torch."""
+        return NumpySolver(self.weights.layers) if self.weights.layers else model().whole
+
+    @cached_property
+    def local(self) -> LocalEncoder:
+        """The encoder of local patches. Raises ModelError where the file's does not fit."""
+        if not self.weights.local:
+            return model().local
+        try:
+            return LocalEncoder.of(self.weights.local)
+        except ValueError as error:
+            raise ModelError(
+                f"{self.name}: the weights do not fit the local encoder ({error}); use one written by `fmr train`"
+            ) from None
+
+    @property
+    def verdict(self) -> dict[str, Any] | None:
+        """The file's own calibration of the verdict, or None."""
+        return self.weights.verdict
+
+    def on(self, device: Device) -> Encoder:
+        """The encoder of whole clouds as torch has it."""
+        from fmr_cli.feature_metric.encoder import Encoder
+
+        return Encoder.of(self.whole.layers).to(pick_device(device))
+
+
+def model(path: Path | str | None = None) -> Model:
+    """What a .safetensors file holds, or the bundled files; loaded once, and anew where it has changed.
+
+    Raises ModelError where it is missing or does not fit.
+    """
+    if path is None:
+        return _bundled()
+    path = Path(path)
+    if not path.is_file():
+        read_weights(path)  # which says what is wrong
+    status = path.stat()
+    return _loaded(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=8)
+def _loaded(path: Path, changed: int, size: int) -> Model:
+    return Model(read_weights(path), str(path))
+
+
+@lru_cache(maxsize=1)
+def _bundled() -> Model:
+    with bundled_path() as path, bundled_local_path() as local:
+        return Model(replace(read_weights(path), local=read_weights(local).local), "the bundled model")
+
+
 def load_encoder(path: Path | str) -> Encoder:
-    """The encoder of a .safetensors file, as torch has it, on the CPU. Raises ModelError: missing, or does not fit."""
-    from fmr_cli.feature_metric.encoder import Encoder
-
-    return Encoder.of(read_weights(path).layers)
+    """The encoder of whole clouds of a file, as torch has it, on the CPU. Raises ModelError: missing, does not fit."""
+    return model(path).on("cpu")
 
 
-@lru_cache(maxsize=4)
-def encoder(model: Path | None = None, device: Device = "auto") -> Encoder:
-    """The encoder of a .safetensors file, or the bundled one, as torch has it, loaded once. Raises ModelError."""
-    place = pick_device(device)
-    if model is not None:
-        return load_encoder(model).to(place)
-    with bundled_path() as path:
-        return load_encoder(path).to(place)
+def encoder(path: Path | None = None, device: Device = "auto") -> Encoder:
+    """The encoder of whole clouds of a file, or the bundled one, as torch has it, loaded once. Raises ModelError."""
+    return _on_device(model(path), device)
 
 
 @lru_cache(maxsize=4)
-def fast_encoder(model: Path | None = None) -> NumpySolver:
-    """The encoder of a .safetensors file, or the bundled one, without torch, loaded once. Raises ModelError."""
-    if model is not None:
-        return NumpySolver(read_weights(model).layers)
-    with bundled_path() as path:
-        return NumpySolver(read_weights(path).layers)
+def _on_device(of: Model, device: Device) -> Encoder:
+    return of.on(device)
 
 
-def solver(model: Path | None = None, device: Device = "auto") -> Solver:
+def fast_encoder(path: Path | None = None) -> NumpySolver:
+    """The encoder of whole clouds of a file, or the bundled one, without torch. Raises ModelError."""
+    return model(path).whole
+
+
+def local_encoder(path: Path | None = None) -> LocalEncoder:
+    """The encoder of local patches of a file, or the bundled one. Raises ModelError."""
+    return model(path).local
+
+
+def solver(path: Path | None = None, device: Device = "auto") -> Solver:
     """The IC solver with an encoder's weights: by torch for cuda, else by numpy. Raises ModelError."""
     if device != "cuda":
-        return fast_encoder(model)
+        return fast_encoder(path)
     from fmr_cli.feature_metric.solver import OnDevice
 
-    return OnDevice(encoder(model, device))
+    return OnDevice(encoder(path, device))
 
 
 def bundled_path() -> AbstractContextManager[Path]:
@@ -83,11 +146,9 @@ def bundled_local_path() -> AbstractContextManager[Path]:
 
 def bundled_encoder() -> Encoder:
     """The bundled encoder, as torch has it, on the CPU."""
-    return encoder(None, "cpu")
+    return model().on("cpu")
 
 
-@lru_cache(maxsize=1)
 def bundled_local_encoder() -> LocalEncoder:
     """The bundled encoder of local patches."""
-    with bundled_local_path() as path:
-        return LocalEncoder.load(path)
+    return model().local

@@ -48,12 +48,18 @@ class Options:
     )
     up: tuple[float, float, float] = option((0.0, 0.0, 1.0), "the vertical, of any length; z if not given")
     scale: bool = option(False, "also estimate one scale factor")
+    unit: str | None = option(
+        None, "the units of source and target, where they are two, such as mm:m; also cm, km, in, ft, us-ft, yd"
+    )
+    allow_mirror: bool = option(False, "also try the mirror image of the source, as of left-handed files")
     max_angle: float | None = option(None, "no rotation beyond it, in degrees", least=0)
     max_shift: float | None = option(None, "no shift of the source's centre beyond it", least=0)
     iterations: int = option(10, "of the solver from one start, at most", least=1)
     robust: bool = option(True, "robust steps on both clouds' Jacobians, or the paper's plain ones on the target's")
     refine: bool = option(True, "a last geometric polish (GICP)")
-    model: Path | None = option(None, "weights of the global encoder (.safetensors); the bundled ones if not given")
+    model: Path | None = option(
+        None, "what `fmr train` has learnt (.safetensors): the encoders, the verdict; the bundled ones if not given"
+    )
     device: Literal["auto", "cpu", "cuda"] = option(
         "auto", "where the solver of the global feature runs: cpu, cuda, or auto: the CPU, fast enough for a pair"
     )
@@ -66,6 +72,8 @@ class Options:
                 object.__setattr__(self, f.name, checked(f, value))
         if not isinstance(self.init, str):
             object.__setattr__(self, "init", checked_pose(self.init, self.scale))
+        if self.unit is not None and (self.scale or not isinstance(self.init, str)):
+            raise OptionsError(f"--unit {self.unit}: leave it out with --scale, or with a transform for --init")
 
 
 def flag(name: str) -> str:
@@ -93,6 +101,11 @@ def checked(f: Field, value: Any) -> Any:
         if not isinstance(value, str | Path):
             raise OptionsError(f"{said}: is no path, give a .safetensors file")
         return Path(value)
+    if f.name == "unit":
+        from fmr_cli.registration.units import factor_of
+
+        factor_of(value)
+        return value
     if f.type is bool:
         if value not in (True, False):
             raise OptionsError(f"{said}: is neither true nor false")

@@ -18,7 +18,7 @@ from fmr_cli.feature_metric.inverse_compositional import Template
 from fmr_cli.geometry.frames import Frame, enter_frames, leave_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.sampling import sample
-from fmr_cli.registration.models import bundled_local_encoder, fast_encoder, solver
+from fmr_cli.registration.models import fast_encoder, local_encoder, solver
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.prepared import MIN_POINTS, Prepared, pair_edge
 from fmr_cli.registration.units import unit_hint
@@ -41,7 +41,7 @@ class Pair:
     ) -> None:
         self.source, self.target, self.options, self.threads = source, target, options, threads
         self.edge, self.keypoints, self.seed = edge, keypoints, options.seed
-        self.encoder, self.local = fast_encoder(options.model), bundled_local_encoder()
+        self.encoder, self.local = fast_encoder(options.model), local_encoder(options.model)
         self.solver = solver(options.model, options.device)
         up = np.asarray(options.up, float)
         up /= np.linalg.norm(up)

@@ -18,14 +18,14 @@ from threadpoolctl import ThreadpoolController
 
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration import hypotheses, refinement
+from fmr_cli.registration import hypotheses, mirror, refinement
 from fmr_cli.registration.confidence import LIKELY, Judge
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
-from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.prepared import Prepared, check_systems
 from fmr_cli.registration.result import Registration, Stopwatch, describe
-from fmr_cli.registration.units import unit_hint
+from fmr_cli.registration.units import factor_of, unit_hint
 
 REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
@@ -53,18 +53,48 @@ def align(
 ) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
+    With ``options.allow_mirror`` the mirror image of the source is registered too, unless the source is ``aligned``; R
+    then has the determinant -1, and ``mirrored`` says so.
+
     threads: 2 for what concerns one cloud alone to be done for both side by side, 1 where pairs run side by side
     already. The answer is the same bit for bit, whatever their number and the machine's. check: also let the paper's IC
     solver go on from the pose found, see ``Registration.feature_check``. Raises RegistrationError
     where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
     contradict each other.
     """
+    found = as_they_are(source, target, options, threads, check)
+    if not options.allow_mirror or found.status == "aligned":
+        return found
+    image = mirror.image(source, options.seed)
+    other = as_they_are(image, target, options, threads, check)
+    return mirror.undone(other, image.centre) if other.status == "aligned" else found
+
+
+def mirror_fits(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options) -> float | None:
+    """The confidence that the mirror image of the source fits the target, where a quick look is sure of it."""
+    time = Stopwatch()
+    with one_blas_thread(), suppress(RegistrationError):
+        image = mirror.image(source, options.seed)
+        target = target if isinstance(target, Prepared) else prepare(target, options.seed)
+        for detail in (FIRST, FURTHER[0]):
+            judge = Judge(make_pair(image, target, options, 2, *detail))
+            consider(judge, features(judge.pair, time), time)
+            if judge.sure(SURE):
+                return judge.best.confidence
+    return None
+
+
+def as_they_are(
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, threads: int, check: bool
+) -> Registration:
+    """``align`` without a mirror."""
     time = Stopwatch()
     with one_blas_thread():
         with time.stage("prepare"), ThreadPoolExecutor(threads) as pool:
             source, target = pool.map(
                 lambda x: x if isinstance(x, Prepared) else prepare(x, options.seed), (source, target)
             )
+        check_systems(source, target)
         verdicts = [
             (factor, look(source if factor == 1.0 else source.scaled(factor), target, given, threads, time))
             for factor, given in scales(source, target, options)
@@ -81,7 +111,11 @@ def align(
             with time.stage("check"):
                 found.feature_check = feature_check(judge.pair, best.T_target_source)
     found.warnings += [*source.notes, *target.notes]
-    if found.status != "aligned" and not options.scale and (hint := unit_hint(source.points, target.points)):
+    if (
+        found.status != "aligned"
+        and not (options.scale or options.unit)
+        and (hint := unit_hint(source.points, target.points))
+    ):
         found.warnings.append(hint)
     found.seconds = time.seconds
     return found
@@ -195,7 +229,7 @@ def may_overlap_fully(pair: Pair) -> bool:
 def scales(source: Prepared, target: Prepared, options: Options) -> Iterator[tuple[float, Options]]:
     """What to multiply the source by, with the options for it: a given pose's own scale, or some about the clouds'."""
     if not options.scale:
-        yield 1.0, options
+        yield factor_of(options.unit) if options.unit else 1.0, options
     elif not isinstance(options.init, str):
         T = np.array(options.init, float)
         factor = float(np.cbrt(np.linalg.det(T[:3, :3])))

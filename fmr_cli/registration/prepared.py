@@ -15,6 +15,7 @@ from fmr_cli.geometry.smoothing import roughness
 from fmr_cli.geometry.strays import Strays, strays
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_downsample
+from fmr_cli.io.crs import code_of, in_degrees, name_of, same
 from fmr_cli.registration.memo import Memo
 
 MIN_POINTS = 10  # fewer say nothing about a surface
@@ -39,7 +40,9 @@ class Prepared:
         points = points[np.isfinite(points).all(1)]
         found = strays(points, np.random.default_rng(seed)) if len(points) else Strays(np.ones(0, bool), {})
         points = points[found.keep]
-        self.notes = [f"{cloud.name}: {n} points {why} are no surface, set aside" for why, n in found.reasons.items()]
+        self.notes = [
+            f"{cloud.name}: {n} points {why} are no surface, set aside" for why, n in found.reasons.items() if n
+        ]
         self.frame = Frame(points.mean(0) if len(points) else np.zeros(3))
         points = distinct(self.frame.enter(points))
         if len(points) == 1 and len(cloud) > 1:
@@ -48,7 +51,12 @@ class Prepared:
             raise RegistrationError(
                 f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
             )
-        self.name, self.read, self.seed = cloud.name, cloud.count, seed
+        self.name, self.read, self.seed, self.crs = cloud.name, cloud.count, seed, cloud.crs
+        if cloud.crs and in_degrees(cloud.crs, cloud.points.min(0), cloud.points.max(0)):
+            raise RegistrationError(
+                f"{cloud.name}: is in degrees ({name_of(cloud.crs)}), which are no lengths: project it first, "
+                "by `fmr transform FILE --crs EPSG:... -o OUT` say"
+            )
         self.plane = plane_of(points)
         self.points = points if self.plane is None else raised(points, self.plane, rng)
         self.edge, self.spacing = working_scale(self.points, rng)
@@ -75,7 +83,7 @@ class Prepared:
             index = surface.keypoints(count)
             return surface.points[index], encoder(describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS)))
 
-        return self._described.get((edge, count, id(encoder)), describe)
+        return self._described.get((edge, count, encoder.key), describe)
 
     def fine(self, count: int, edge: float) -> np.ndarray:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
@@ -98,6 +106,16 @@ class Prepared:
             return GicpCloud(sample(self.points, count, rng) if own else self.fine(count, edge), edge, threads)
 
         return self._gicp.get((count, edge, own), make)
+
+
+def check_systems(source: Prepared, target: Prepared) -> None:
+    """Raises RegistrationError where the files state two coordinate reference systems."""
+    a, b = source.crs, target.crs
+    if a and b and same(a, b) is False:
+        raise RegistrationError(
+            f"{source.name} is in {name_of(a)} and {target.name} in {name_of(b)}: bring them into one system first, "
+            f"by `fmr transform {source.name} --crs {code_of(b) or 'EPSG:...'} -o OUT` say"
+        )
 
 
 def pair_edge(source: Prepared, target: Prepared) -> float:

@@ -47,6 +47,7 @@ class Registration:
     alternatives: other poses that would be called aligned if alone, as of a symmetric shape, best first:
         T_target_source, confidence, feature_error.
     reasons: why the status is not "aligned", in words. evidence: what the verdict is made of.
+    mirrored: whether T mirrors, which only ``options.allow_mirror`` allows.
     points: points read and points used. seconds: wall time by stage, and total.
     """
 
@@ -73,6 +74,7 @@ class Registration:
     options: Options
     seconds: dict[str, float] = field(default_factory=dict)
     feature_check: dict[str, Any] = field(default_factory=dict)
+    mirrored: bool = False
     reasons: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 

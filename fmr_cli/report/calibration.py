@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fmr_cli.io.files import atomic_write
 from fmr_cli.registration.confidence import ALIGNED
+from fmr_cli.report import plots
 
 BINS = (0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.01)  # edges in confidence; the last bin holds 1
 
@@ -29,14 +29,16 @@ def calibration_table(confidence: np.ndarray, right: np.ndarray) -> str:
 
 def plot_calibration(path: Path, confidence: np.ndarray, right: np.ndarray) -> None:
     """Confidence against the share that is right, in tenths of the pairs; an image file by the path's suffix."""
-    from matplotlib.figure import Figure
-
     edges = np.quantile(confidence, np.linspace(0, 1, 11))
     bins = [(confidence >= a) & (confidence <= b) for a, b in itertools.pairwise(edges)]
-    figure = Figure((5, 5), layout="constrained")
-    axes = figure.subplots()
-    axes.plot([0, 1], [0, 1], color="0.7")
-    axes.plot([confidence[b].mean() for b in bins], [right[b].mean() for b in bins], "o-")
-    axes.set(xlabel="confidence", ylabel="share that is right", title=f"{len(confidence)} pairs not fitted")
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    shares = [float(right[b].mean()) for b in bins]
+    low, high = zip(*(plots.binomial(s, int(b.sum())) for s, b in zip(shares, bins, strict=True)), strict=True)
+    with plots.figure(path, plots.COLUMN, plots.COLUMN) as figure:
+        axes = figure.subplots()
+        axes.plot([0, 1], [0, 1], color=plots.COLORS[4], linewidth=0.8)
+        axes.annotate("as said", (0.5, 0.5), (4, -8), textcoords="offset points", color=plots.COLORS[4])
+        middles = [float(confidence[b].mean()) for b in bins]
+        axes.vlines(middles, low, high, color=plots.COLORS[0], linewidth=0.9)
+        axes.plot(middles, shares, "o", color=plots.COLORS[0])
+        axes.set(xlabel="confidence", ylabel="share that is right (95 % interval)",
+                 title=f"{len(confidence)} pairs not fitted")  # fmt: skip

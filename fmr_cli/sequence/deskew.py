@@ -18,14 +18,14 @@ def scan_times(cloud: PointCloud) -> np.ndarray:
     name = next((n for n in TIME_FIELDS if n in cloud.attributes and cloud.attributes[n].ndim == 1), None)
     if name is None:
         known = ", ".join(TIME_FIELDS)
-        raise CloudFileError(f"{cloud.name}: has no time per point (fields {known}), leave out --deskew")
+        raise CloudFileError(f"{cloud.name}: has no time per point (fields {known}), use --no-deskew")
     values = cloud.attributes[name]
     finite = np.isfinite(values)
     # Subtracted in the file's type: nanoseconds since 1970 have more digits than float64.
     since = (values - values[finite].min()).astype(np.float64) if finite.any() else np.zeros(len(values))
     last = since[finite].max(initial=0.0)
     if not last > 0:
-        raise CloudFileError(f"{cloud.name}: field {name} is the same for all points, leave out --deskew")
+        raise CloudFileError(f"{cloud.name}: field {name} is the same for all points, use --no-deskew")
     return np.where(finite, since / last, 0.5)
 
 

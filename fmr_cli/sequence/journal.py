@@ -59,16 +59,14 @@ class Journal:
             raise FmrError(
                 f"{self.path}: was begun with other settings ({', '.join(changed)}), use those or leave out --resume"
             )
-        frame = VoxelFrame(header["voxel"], np.array(header["origin"]))
-        return Beginning(frame, np.array(header["T_first_second"])), lines
+        return Beginning(VoxelFrame.from_json(header["frame"]), np.array(header["T_first_second"])), lines
 
     def begin(self, beginning: Beginning, lines: list[dict[str, Any]]) -> None:
         """Write the header, and the lines of an earlier run again; opened for more."""
         if self.path is None:
             return
         header = self.settings | {
-            "voxel": beginning.frame.voxel,
-            "origin": beginning.frame.origin.tolist(),
+            "frame": beginning.frame.to_json(),
             "T_first_second": beginning.T_first_second.tolist(),
         }
         with atomic_write(self.path) as part:

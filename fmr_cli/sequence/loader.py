@@ -48,10 +48,11 @@ class Loader:
     """
 
     def __init__(
-        self, scans: Scans, beginning: Beginning, T_first_scan: list[np.ndarray], *, deskewed: bool, keep_clouds: bool
-    ) -> None:
+        self, scans: Scans, beginning: Beginning, T_first_scan: list[np.ndarray], *, deskewed: bool, strict: bool,
+        keep_clouds: bool,
+    ) -> None:  # fmt: skip
         self.scans, self.beginning, self.T_first_scan = scans, beginning, T_first_scan
-        self.deskewed, self.keep_clouds = deskewed, keep_clouds
+        self.deskewed, self.strict, self.keep_clouds = deskewed, strict, keep_clouds
         self.usual_sizes: deque[float] = deque(maxlen=SIZES_KEPT)
 
     def ahead(self, start: int) -> Generator[Loaded, None, None]:
@@ -120,7 +121,12 @@ class Loader:
         """The scan deskewed, by constant velocity from the two frames before it."""
         if not self.deskewed:
             return cloud
-        times = scan_times(cloud)
+        try:
+            times = scan_times(cloud)
+        except CloudFileError:
+            if self.strict:
+                raise
+            return cloud
         T_begin_end = self.beginning.T_first_second
         if index > 1:
             T_begin_end = np.linalg.inv(self.T_first_scan[index - 2]) @ self.T_first_scan[index - 1]

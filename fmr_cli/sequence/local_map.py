@@ -8,6 +8,7 @@ import numpy as np
 import small_gicp
 
 from fmr_cli.cloud import transform_points
+from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.observability import (
     STANDING,
     WRONG,
@@ -18,7 +19,7 @@ from fmr_cli.sequence.observability import (
     observe,
 )
 from fmr_cli.sequence.plane_map import PlaneMap
-from fmr_cli.sequence.prepared_scan import PreparedScan
+from fmr_cli.sequence.prepared_scan import MIN_POINTS, NEIGHBOURS, PreparedScan
 
 # Edges of the map's three levels, voxels: the working one, and two from which larger motions are reached.
 FINE, COARSE, WIDE = 1.0, 2.0, 8.0
@@ -42,7 +43,7 @@ class Fit:
     overlap: the share of the scan's points that have a counterpart on the map. cost: their mean squared distance over
     the local variance, halved. start: the initial guess it came from. rms: distance of those points from the map's
     planes, voxels, NaN before ``LocalMap.polish``; seen: which directions are observed, None before it, and where too
-    few points lie on planes to tell.
+    few points lie on planes to tell. verified: the registration onto the scan before has shown that it is right.
     """
 
     T_map_scan: np.ndarray
@@ -51,6 +52,7 @@ class Fit:
     start: str
     rms: float = float("nan")
     seen: Observability | None = None
+    verified: bool = False
 
     @property
     def total(self) -> float:
@@ -68,12 +70,14 @@ class Keyframe:
 
 
 class LocalMap:
-    """The last keyframes as Gaussian voxel maps of three edges, and as planes.
+    """The last keyframes as Gaussian voxel maps of three edges, and as planes; a known map below them, if there is one.
 
-    It is a function of ``keyframes`` alone: so it can be built again after a kill.
+    It is a function of these alone: so it can be built again after a kill. Keyframes add to a known map only where it
+    has nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, known: KnownMap | None = None) -> None:
+        self.known = known
         self.keyframes: list[Keyframe] = []
         self._clear()
 
@@ -81,7 +85,11 @@ class LocalMap:
         self.levels = {edge: small_gicp.GaussianVoxelMap(edge) for edge in (FINE, COARSE, WIDE)}
         for level in self.levels.values():
             level.set_lru(horizon=NO_LRU)
-        self.planes = PlaneMap()
+        self.planes = PlaneMap(two_sided=self.known is not None)
+        if self.known:
+            for level in self.levels.values():
+                level.insert(self.known.cloud)
+            self.planes.insert(self.known.points, self.known.normals, np.eye(4))
 
     def insert(self, index: int, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
         """Add a keyframe; where there are many, the oldest are forgotten."""
@@ -91,9 +99,21 @@ class LocalMap:
             self._clear()
             added = self.keyframes = self.keyframes[-MAP_KEYFRAMES:]
         for keyframe in added:
-            for level in self.levels.values():
-                level.insert(keyframe.scan.cloud, keyframe.T_map_scan)
-            self.planes.insert(keyframe.scan.points, keyframe.scan.normals, keyframe.T_map_scan)
+            self._add(keyframe)
+
+    def _add(self, keyframe: Keyframe) -> None:
+        scan, T_map_scan = keyframe.scan, keyframe.T_map_scan
+        points, normals, cloud = scan.points[scan.solid], scan.normals[scan.solid], scan.cloud
+        if self.known:
+            new = self.known.beyond(transform_points(T_map_scan, points))
+            if new.sum() < MIN_POINTS:
+                return
+            points, normals = points[new], normals[new]
+            cloud = small_gicp.PointCloud(points)
+            small_gicp.estimate_normals_covariances(cloud, num_neighbors=NEIGHBOURS)
+        for level in self.levels.values():
+            level.insert(cloud, T_map_scan)
+        self.planes.insert(points, normals, T_map_scan)
 
     def fit(self, scan: PreparedScan, T_map_guess: np.ndarray, edges: tuple[float, ...], start: str) -> Fit:
         """The scan's pose near a guess, by distribution-to-distribution ICP on the levels ``edges``, one after another.
@@ -117,14 +137,14 @@ class LocalMap:
         slope: how residuals grow with range, see ``plane_map.trust``.
         """
         T_map_scan, rms, slope, matches = self.planes.fit(
-            scan.points, scan.normals, scan.ranges, fit.T_map_scan, slope
+            scan.points, scan.normals, scan.ranges, scan.solid, fit.T_map_scan, slope
         )  # fmt: skip
         seen = self._seen(scan, T_map_scan, matches) if matches else None
         return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms, seen=seen), slope
 
     def _seen(self, scan: PreparedScan, T_map_scan: np.ndarray, matches: Matches) -> Observability:
         some = scan.points[::EVERY]
-        moved = min(displacement(T_map_scan, keyframe.T_map_scan, some) for keyframe in self.keyframes)
+        moved = min((displacement(T_map_scan, k.T_map_scan, some) for k in self.keyframes), default=np.inf)
         wrong = WRONG_STANDING if moved < STANDING else WRONG
         return clearly_observed(matches, wrong) or observe(matches, scan.trust[matches.index], wrong)
 

@@ -1,6 +1,10 @@
-"""Places seen before: found among spatial neighbours, verified by registration, and closed by a pose graph (GTSAM).
+"""Places seen before: sought where the path comes near itself and by what they look like, and proved by registration.
 
-Lengths are in voxels and poses are T_map_scan, as in ``odometry``.
+A loop is believed where the verdict of ``align`` is "aligned" and the map of the place agrees with it; one that lies
+further off than the path can have drifted only where another one tells the same. They are closed by a pose graph
+(GTSAM), each with the information that the scan has at the place; while one does not fit the closed path, the worst is
+dropped (Baarda's data snooping: a robust kernel would rather believe the path, whose drift is no noise). Lengths are in
+voxels and poses are T_map_scan, as in ``odometry``.
 """
 
 from __future__ import annotations
@@ -11,28 +15,37 @@ from functools import lru_cache
 
 import numpy as np
 
-from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, LocalMap, displacement
+from fmr_cli.multiway import looks
+from fmr_cli.multiway.pose_graph import adjoint, bounded, prior_factor, symmetric
+from fmr_cli.registration.models import local_encoder
+from fmr_cli.sequence.local_map import COARSE, FINE, LocalMap, displacement
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
-# Set by hand on simulated rounds and on the drives of the tests; lengths in voxels.
+# Set by hand on simulated rounds; lengths in voxels.
 SPACING = 10.0  # between the keyframes that loops are sought for
 RADIUS, DRIFT = 25.0, 0.02  # how near a place must seem: a distance, and a share of the path since
 DETOUR = 4.0  # a loop's path is at least so many times that distance
 NEIGHBOURS = 2  # keyframes on either side that make up the place's map
-MIN_OVERLAP, MAX_TOTAL = 0.5, 2.3  # of a loop that is believed, see ``local_map.Fit`` and ``odometry.CONVINCING``
-AGREE = 1.0  # loops found from the two starts must put the scan in the same place to so much
+AGREE = 2.0  # so near must the place's map put the scan to where registration puts it; and a closed path to its loops
+REST = 3  # keyframes after a loop in which no other is sought: they would say the same
+LOOKALIKES = 20  # places that only look alike, the most promising, that are registered
+EDGE = 2.0  # of the grid on which places are described
 STEP_SIGMA = np.array([1e-3] * 3 + [2e-2] * 3)  # radians, voxels: of the motion between two frames
 GAP_SIGMA = 100 * STEP_SIGMA  # where one of them is uncertain
-HUBER = 1.345  # sigmas, beyond which a loop's residual counts less: 95 % efficient where all are normal
 
 
 @dataclass(frozen=True)
 class Loop:
-    """Frame ``later`` seen from frame ``earlier``: T_earlier_later (4, 4)."""
+    """Frame ``later`` seen from frame ``earlier``: T_earlier_later (4, 4).
+
+    information: (6, 6) of a twist (omega, v) on its left. expected: whether the path comes near itself there.
+    """
 
     earlier: int
     later: int
     T_earlier_later: np.ndarray
+    information: np.ndarray
+    expected: bool = True
 
 
 def close_loops(
@@ -43,13 +56,25 @@ def close_loops(
     sure: (n,), False where a pose is no more than a prediction. load: gives a frame's scan.
     """
     keys = keyframes(poses, sure)
+    path = path_lengths(poses)
     load = lru_cache(maxsize=4 * NEIGHBOURS + 2)(load)
-    loops = []
-    for earlier, later in candidates(poses, keys):
-        T_earlier_later = verify(poses, keys, earlier, later, load)
-        if T_earlier_later is not None:
-            loops.append(Loop(keys[earlier], keys[later], T_earlier_later))
-    return (optimise(poses, sure, loops) if loops else poses), loops
+    near = candidates(poses, keys)
+    loops = proved(near, poses, keys, load, expected=True)
+    alike = [pair for pair in lookalikes(path, keys, load) if pair not in near]
+    loops += proved(alike, poses, keys, load, expected=False)
+    loops = [loop for loop in loops if loop.expected or confirmed(loop, loops, poses, path)]
+    while loops:
+        closed = optimise(poses, sure, loops)
+        off = [apart(loop, closed, load(loop.later).points) for loop in loops]
+        if max(off) <= AGREE:
+            return closed, loops
+        del loops[int(np.argmax(off))]
+    return poses, []
+
+
+def path_lengths(poses: np.ndarray) -> np.ndarray:
+    """(n,): how far each of the poses (n, 4, 4) is along the path."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
 
 def keyframes(poses: np.ndarray, sure: np.ndarray) -> list[int]:
@@ -65,7 +90,7 @@ def keyframes(poses: np.ndarray, sure: np.ndarray) -> list[int]:
 def candidates(poses: np.ndarray, keys: list[int]) -> list[tuple[int, int]]:
     """For each keyframe, the nearest one that lies near in space and far along the path, as places in ``keys``."""
     centres = poses[:, :3, 3]
-    path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
+    path = path_lengths(poses)
     found = []
     for later in range(1, len(keys)):
         apart = np.linalg.norm(centres[keys[:later]] - centres[keys[later]], axis=1)
@@ -77,32 +102,88 @@ def candidates(poses: np.ndarray, keys: list[int]) -> list[tuple[int, int]]:
     return found
 
 
-def verify(
-    poses: np.ndarray, keys: list[int], earlier: int, later: int, load: Callable[[int], PreparedScan]
-) -> np.ndarray | None:
-    """T_earlier_later of two keyframes, or None where they do not show the same place.
+def lookalikes(path: np.ndarray, keys: list[int], load: Callable[[int], PreparedScan]) -> list[tuple[int, int]]:
+    """Keyframes far apart along the path that look most like one place, as places in ``keys``: (earlier, later)."""
+    if len(keys) < 2:
+        return []
+    from fmr_cli.geometry.motion import Motion
 
-    It is sought from where the odometry and from where the feature-metric registration put the scan; both must agree,
-    unless the first alone is beyond doubt.
+    described = [looks.describe(load(key).for_align, EDGE, local_encoder()) for key in keys]
+    alike = looks.similarity(described)
+    found = []
+    for later in range(1, len(keys)):
+        score = np.where(path[keys[later]] - path[keys[:later]] < DETOUR * RADIUS, -np.inf, alike[later, :later])
+        if np.isfinite(score).any():
+            earlier = int(np.argmax(score))
+            found.append((looks.look(described[later], described[earlier], Motion()).promise, earlier, later))
+    best = sorted(found, reverse=True)[:LOOKALIKES]
+    return sorted(((earlier, later) for _, earlier, later in best), key=lambda pair: pair[1])
+
+
+def proved(
+    pairs: list[tuple[int, int]], poses: np.ndarray, keys: list[int], load: Callable[[int], PreparedScan],
+    *, expected: bool,
+) -> list[Loop]:  # fmt: skip
+    """The loops among pairs of places in ``keys``, each (earlier, later), in the order of the later one."""
+    loops: list[Loop] = []
+    last = -REST - 1
+    for earlier, later in pairs:
+        if later - last <= REST:
+            continue
+        loop = verify(poses, keys, earlier, later, load, expected)
+        if loop is not None:
+            loops.append(loop)
+            last = later
+    return loops
+
+
+def verify(
+    poses: np.ndarray, keys: list[int], earlier: int, later: int, load: Callable[[int], PreparedScan], expected: bool
+) -> Loop | None:
+    """The loop of two keyframes, or None where registration does not say surely that they show one place.
+
+    Where the path comes near itself there, the loop must also lie within what the path may have drifted.
     """
+    from fmr_cli.registration import align
+
+    scan = load(keys[later])
+    found = align(scan.for_align, load(keys[earlier]).for_align)
+    if found.status != "aligned":
+        return None
     T_earlier_map = np.linalg.inv(poses[keys[earlier]])
+    drifted = np.linalg.norm((T_earlier_map @ poses[keys[later]] - found.T_target_source)[:3, 3])
+    between = path_lengths(poses[keys[earlier] : keys[later] + 1])[-1]
+    if expected and drifted > AGREE + DRIFT * between:
+        return None
     place = LocalMap()
     for key in keys[max(earlier - NEIGHBOURS, 0) : min(earlier + NEIGHBOURS + 1, later)]:
         place.insert(key, load(key), T_earlier_map @ poses[key])
-    scan = load(keys[later])
-    fits = [place.fit(scan, T_earlier_map @ poses[keys[later]], (WIDE, COARSE, FINE), "odometry")]
-    fits.append(place.fit(scan, np.eye(4), (WIDE, COARSE, FINE), "same place"))
-    best = min(fits, key=lambda fit: fit.total)
-    if displacement(fits[0].T_map_scan, fits[1].T_map_scan, scan.points) > AGREE:
-        from fmr_cli.registration import Options, align
-
-        start = align(scan.for_align, load(keys[earlier]).for_align, Options(init="features", refine=False))
-        third = place.fit(scan, start.T_target_source, (COARSE, FINE), "features")
-        if displacement(best.T_map_scan, third.T_map_scan, scan.points) > AGREE:
-            return None
-    if best.overlap < MIN_OVERLAP or best.total > MAX_TOTAL:
+    fit = place.polish(scan, place.fit(scan, found.T_target_source, (COARSE, FINE), "features"), 0.0)[0]
+    if fit.seen is None or displacement(fit.T_map_scan, found.T_target_source, scan.points) > AGREE:
         return None
-    return place.polish(scan, best, 0.0)[0].T_map_scan
+    about = np.eye(6)  # a twist about the origin as one about the points' centre
+    about[3:, :3] = np.cross(np.eye(3), fit.seen.centre).T
+    information = about.T @ bounded(fit.seen.information, fit.seen.radius, FINE) @ about
+    return Loop(keys[earlier], keys[later], fit.T_map_scan, information, expected)
+
+
+def confirmed(loop: Loop, loops: list[Loop], poses: np.ndarray, path: np.ndarray) -> bool:
+    """Whether another loop tells the same, as far as the path from the one to the other allows to tell."""
+    for other in loops:
+        if other is loop:
+            continue
+        T = np.linalg.inv(poses[other.earlier]) @ poses[loop.earlier] @ loop.T_earlier_later
+        T = T @ np.linalg.inv(poses[loop.later]) @ poses[other.later]
+        off = np.linalg.norm((np.linalg.inv(other.T_earlier_later) @ T)[:3, 3])
+        between = abs(path[loop.later] - path[other.later]) + abs(path[loop.earlier] - path[other.earlier])
+        if off < AGREE + DRIFT * between:
+            return True
+    return False
+
+
+def apart(loop: Loop, poses: np.ndarray, points: np.ndarray) -> float:
+    """How far, voxels, a path puts a loop's later scan of points (N, 3) from where the loop puts it."""
+    return displacement(np.linalg.inv(poses[loop.earlier]) @ poses[loop.later], loop.T_earlier_later, points)
 
 
 def optimise(poses: np.ndarray, sure: np.ndarray, loops: list[Loop]) -> np.ndarray:
@@ -110,7 +191,7 @@ def optimise(poses: np.ndarray, sure: np.ndarray, loops: list[Loop]) -> np.ndarr
     import gtsam
 
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(poses[0]), gtsam.noiseModel.Diagonal.Sigmas(np.full(6, 1e-9))))
+    graph.add(prior_factor(0, poses[0], np.eye(6) * 1e18))
     for i, pose in enumerate(poses):
         values.insert(i, gtsam.Pose3(pose))
         if i:
@@ -118,9 +199,8 @@ def optimise(poses: np.ndarray, sure: np.ndarray, loops: list[Loop]) -> np.ndarr
             step = gtsam.Pose3(np.linalg.inv(poses[i - 1]) @ pose)
             graph.add(gtsam.BetweenFactorPose3(i - 1, i, step, gtsam.noiseModel.Diagonal.Sigmas(sigma)))
     for loop in loops:
-        noise = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Huber.Create(HUBER), gtsam.noiseModel.Diagonal.Sigmas(STEP_SIGMA)
-        )
+        A = adjoint(loop.T_earlier_later)
+        noise = gtsam.noiseModel.Gaussian.Information(symmetric(A.T @ loop.information @ A))
         graph.add(gtsam.BetweenFactorPose3(loop.earlier, loop.later, gtsam.Pose3(loop.T_earlier_later), noise))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return np.stack([found.atPose3(i).matrix() for i in range(len(poses))])

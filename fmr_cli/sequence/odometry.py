@@ -11,15 +11,20 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fmr_cli.errors import RegistrationError
+from fmr_cli.sequence.feature_error import feature_errors
+from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
-from fmr_cli.sequence.motion_model import MotionModel
+from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
+
+if TYPE_CHECKING:
+    from fmr_cli.registration import Registration
 
 # The constants without a reference are set by hand on the drives of the tests (a simulated street; HDL-64 and Kinect
 # sequences): whole numbers and halves, none of them tuned to a decimal.
@@ -32,19 +37,21 @@ MIN_OVERLAP, MAX_COST = 0.35, 3.0
 OVERLAP_DROP = 0.5  # of the running median of overlaps, at least
 DOUBTFUL_OVERLAP, DOUBTFUL_TOTAL = 0.85, 1.25  # against the running medians: beyond, more starts are tried
 CONVINCING = 2.3  # a ``total`` for which one start is enough; right poses have up to 2.1, wrong ones from 2.9
+FALLEN = 0.7  # of the usual overlap: below it the registration onto the scan before is asked, whatever the starts say
+STRIKING = 1.5  # times the usual ``total``: beyond it one start is not enough
 TRUSTED_AFTER = 2  # aligned frames in a row, after which the prediction alone may do
 EXPECTED_ERROR = 3  # times the largest of the last prediction errors: so far may the next one be off
 # Times the distance from the map's planes, beyond which a scan held at the prediction does not fit there. In made-up
 # tunnels and before blank walls it comes to 1.04 at most, wherever along them the scan is held.
 WORSE = 1.1
+# Voxels, of the same distance: below it what differs is how a scanner's pattern lies in the voxels of a curved wall.
+FINEST = 0.05
 # Voxels: an unobserved direction whose sigma is beyond it could matter. Half the voxel that everything here is measured
 # by: 0.05 m for a depth camera in a room, 0.2 m for a LiDAR in a street.
 MATTERS = 0.5
+ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
-
-
-FeatureErrors = tuple[float, float] | None
 
 
 @dataclass(frozen=True)
@@ -54,11 +61,10 @@ class Frame:
     T_first_scan: (4, 4) float64, file units. status: "aligned", or "uncertain": the pose is then the prediction, and
     the scan is kept out of the map. overlap: share of its points with a counterpart on the map. inlier_rmse: their
     root mean square distance from the map's local planes, file units. start: where the accepted pose came from
-    ("first", "prediction", "zero-motion", "features"). feature_errors: before and after, where the feature-metric
-    registration was asked. unobserved: directions along which the scan does not tell its pose, in the first scan's
-    axes ("shift along (1.00, 0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once
-    sigma_shift (file units) or sigma_rotation (degrees), the pose's standard deviations along the worst direction,
-    could matter.
+    ("first", "prediction", "zero-motion", "features"). feature_errors: see ``feature_error``, by the last usable scan.
+    unobserved: directions along which the scan does not tell its pose, in the first scan's axes ("shift along (1.00,
+    0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once sigma_shift (file units) or
+    sigma_rotation (degrees), the pose's standard deviations along the worst direction, could matter.
     """
 
     T_first_scan: np.ndarray
@@ -66,18 +72,18 @@ class Frame:
     overlap: float
     inlier_rmse: float
     start: str
-    feature_errors: FeatureErrors = None
+    feature_errors: tuple[float, float] | None = None
     unobserved: tuple[str, ...] = ()
     sigma_shift: float = 0.0
     sigma_rotation: float = 0.0
 
 
 class Odometry:
-    """Registers scans, in their order, into the frame of the first one."""
+    """Registers scans, in their order, into the frame of the first one, or into that of a known map."""
 
-    def __init__(self, frame: VoxelFrame) -> None:
-        self.frame = frame
-        self.map = LocalMap()
+    def __init__(self, frame: VoxelFrame, known: KnownMap | None = None) -> None:
+        self.frame, self.known = frame, known
+        self.map = LocalMap(known)
         self.motion: MotionModel | None = None  # from the first scan on
         self.last: tuple[int, PreparedScan, np.ndarray]  # index, scan, T_map_scan: the last one that could be used
         self.aligned = self.uncertain = 0  # frames in a row
@@ -87,104 +93,167 @@ class Odometry:
         self.best_total = np.inf  # of the fits since the last keyframe
         self.index = 0
 
-    def register(self, scan: PreparedScan | None) -> Frame:
+    def register(self, scan: PreparedScan | None, told: Told | None = None, pace: float = 1.0) -> Frame:
         """The next frame; None stands for a scan that could not be used, and is bridged by the prediction.
 
+        told: what is known of the motion from the frame before. pace: the time since then over that before it.
         Raises RegistrationError where it is the first one.
         """
         index, self.index = self.index, self.index + 1
         if self.motion is None:
-            return self._begin(index, scan)
-        T_map_predicted = self.motion.predict()
+            return self._begin(index, scan, np.eye(4))
+        expected = self.motion.expect(told, pace)
         if scan is None:
-            return self._bridge(index, None, T_map_predicted, Fit(T_map_predicted, 0.0, np.nan, "prediction"), None)
-        fit, feature_errors = self._best_fit(scan, T_map_predicted)
-        if not self._fits(fit):
-            return self._bridge(index, scan, T_map_predicted, fit, feature_errors)
-        fit = self._polished(scan, fit, T_map_predicted)
-        self._accept(index, scan, T_map_predicted, fit)
-        return self._frame(scan, fit, feature_errors)
+            return self._bridge(index, None, expected, Fit(expected.T_map_scan, 0.0, np.nan, "prediction"))
+        _, last, T_map_last = self.last
+        fit = self._best_fit(scan, expected)
+        if self._fits(fit):
+            fit = self._polished(scan, fit, expected)
+            self._accept(index, scan, expected, fit)
+            frame = self._frame(fit)
+        else:
+            frame = self._bridge(index, scan, expected, fit)
+        T_last_scan = np.linalg.inv(T_map_last) @ self.motion.T_map_scan
+        return replace(frame, feature_errors=feature_errors(last, scan, T_last_scan))
 
-    def _begin(self, index: int, scan: PreparedScan | None) -> Frame:
+    def begin_in_map(self, scan: PreparedScan | None, T_map_guess: np.ndarray | None) -> Frame:
+        """The first frame, in the known map: near a guess (4, 4), or found by registration.
+
+        Raises RegistrationError where it isn't found.
+        """
+        index, self.index = self.index, self.index + 1
+        return self._begin(index, scan, self._place(scan, T_map_guess) if scan else np.eye(4))
+
+    def _place(self, scan: PreparedScan, T_map_guess: np.ndarray | None) -> np.ndarray:
+        assert self.known
+        if T_map_guess is None:
+            T_map_guess, why = self.known.locate(scan)
+            if T_map_guess is None:
+                raise RegistrationError(f"is not found in the map ({why}); give its pose with --init-poses")
+        fit = self.map.fit(scan, T_map_guess, (WIDE, COARSE, FINE), "given")
+        if not self._fits(fit):
+            raise RegistrationError(
+                f"does not fit the map where it is said to be (overlap {fit.overlap:.2f}); correct its pose"
+            )
+        return self.map.polish(scan, fit, 0.0)[0].T_map_scan
+
+    def _begin(self, index: int, scan: PreparedScan | None, T_map_scan: np.ndarray) -> Frame:
         if scan is None:
             raise RegistrationError("the first scan has too few points to start from, leave it out with --start")
-        here = np.eye(4)
-        self.map.insert(index, scan, here)
-        self.motion = MotionModel(here, float(np.sqrt((scan.ranges**2).mean())))
-        self.last, self.aligned = (index, scan, here), 1
-        return Frame(np.eye(4), "aligned", 1.0, 0.0, "first")
+        self.map.insert(index, scan, T_map_scan)
+        self.motion = MotionModel(T_map_scan, float(np.sqrt((scan.ranges**2).mean())))
+        self.last, self.aligned = (index, scan, T_map_scan), 1
+        return Frame(self.frame.pose_to_file(T_map_scan), "aligned", 1.0, 0.0, "first")
 
-    def _best_fit(self, scan: PreparedScan, T_map_predicted: np.ndarray) -> tuple[Fit, FeatureErrors]:
-        """Trust the prediction while predictions have been good; else compare starts by what they come to."""
-        expected = EXPECTED_ERROR * max(self.errors, default=np.inf)
-        fits = []
+    def _best_fit(self, scan: PreparedScan, next_frame: Expected) -> Fit:
+        """Trust the prediction while predictions have been good; else compare starts by what they come to.
+
+        Where none fits the map, the registration onto the scan before counts, if its verdict is "aligned".
+        """
+        T_map_predicted, expected = next_frame.T_map_scan, EXPECTED_ERROR * max(self.errors, default=np.inf)
+        # The widest level reaches far, and slides along a street: it only ever competes with the narrower ones.
+        fits = [] if expected < FINE else [self.map.fit(scan, T_map_predicted, (COARSE, FINE), "prediction")]
         if self.aligned > TRUSTED_AFTER:
-            edges = (FINE,) if expected < FINE else (COARSE, FINE)
-            fit = self.map.fit(scan, T_map_predicted, edges, "prediction")
+            fit = fits[0] if fits else self.map.fit(scan, T_map_predicted, (FINE,), "prediction")
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
-                return fit, None
+                return fit
             fits = [fit]
         assert self.motion
-        starts = {"zero-motion": self.motion.T_map_last[-1]}
-        if len(self.motion.T_map_last) > 1:
+        starts = {"zero-motion": self.motion.T_map_scan}
+        if self.motion.begun or next_frame.told:
             starts = {"prediction": T_map_predicted, **starts}
         fits += [self.map.fit(scan, T, (WIDE, COARSE, FINE), name) for name, T in starts.items()]
         best = min(fits, key=lambda fit: fit.total)
         same = all(displacement(fit.T_map_scan, best.T_map_scan, scan.points) < FINE / 2 for fit in fits)
-        if self._fits(best) and ((len(fits) > 1 and same) or best.total < CONVINCING):
-            return best, None
-        T_map_features, feature_errors = self._feature_start(scan)
+        if self._fits(best) and not self._fallen(best) and ((len(fits) > 1 and same) or self._convincing(best)):
+            return best
+        found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
-        return min(best, by_features, key=lambda fit: fit.total), feature_errors
+        best = min(best, by_features, key=lambda fit: fit.total)
+        if found.status != "aligned":
+            return best
+        if not self._fits(best):
+            best = by_features
+        if displacement(best.T_map_scan, T_map_features, scan.points) > FINE:
+            return best if self._fits(best) else replace(by_features, T_map_scan=T_map_features, verified=True)
+        return replace(best, verified=True)
 
-    def _feature_start(self, scan: PreparedScan) -> tuple[np.ndarray, FeatureErrors]:
-        """Where feature-metric registration puts the scan, by the last one that could be used."""
+    def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
+        """The registration onto the last scan that could be used, and where that puts the scan in the map."""
         from fmr_cli.registration import Options, align
 
         _, last, T_map_last = self.last
-        found = align(scan.for_align, last.for_align, Options(refine=False))
-        return T_map_last @ found.T_target_source, (found.feature_error_before, found.feature_error_after)
+        found = align(scan.for_align, last.for_align, Options(init="features"))
+        return found, T_map_last @ found.T_target_source
 
     def _fits(self, fit: Fit) -> bool:
         usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
-        return fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST
+        return fit.verified or (fit.overlap >= max(MIN_OVERLAP, OVERLAP_DROP * usual) and fit.cost <= MAX_COST)
+
+    def _fallen(self, fit: Fit) -> bool:
+        """Whether so little of the scan has a counterpart that starts which agree may all be wrong."""
+        return bool(self.usual) and fit.overlap < FALLEN * float(np.median([overlap for overlap, _ in self.usual]))
+
+    def _convincing(self, fit: Fit) -> bool:
+        """Whether a pose that one start alone has found needs no other opinion."""
+        usual = float(np.median([total for _, total in self.usual])) if self.usual else np.inf
+        return fit.total < min(CONVINCING, STRIKING * usual)
 
     def _usual(self, fit: Fit) -> bool:
         """Whether the fit is as good as the last ones; a scanner's rings on the ground hold it where it was, too."""
         overlap, total = np.median(self.usual, axis=0)
         return self._fits(fit) and fit.overlap > DOUBTFUL_OVERLAP * overlap and fit.total < DOUBTFUL_TOTAL * total
 
-    def _polished(self, scan: PreparedScan, fit: Fit, T_map_predicted: np.ndarray) -> Fit:
+    def _polished(self, scan: PreparedScan, fit: Fit, expected: Expected) -> Fit:
         """The fit's exact pose; along directions that are not observed, the prediction's.
 
-        Two things can show that such a direction is observed after all: the scan does not fit there, or there all of
-        it is observed.
+        Three things can show that such a direction is observed after all: a pose further off fits and is observed in
+        all directions; the scan does not fit at the prediction; or there all of it is observed.
         """
         assert self.motion
         usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
-        fit, slope = self.map.polish(scan, fit, usual_slope)
+        found, (fit, slope) = fit, self.map.polish(scan, fit, usual_slope)
         if np.isfinite(slope):
             self.slopes.append(slope)
+        if fit.verified:  # by the scan before, whatever little the map has there
+            same = fit.seen is not None and displacement(fit.T_map_scan, found.T_map_scan, scan.points) < FINE
+            return replace(fit, seen=fit.seen.as_observed()) if fit.seen and same else replace(found, rms=fit.rms)
         if fit.seen is None or fit.seen.observed.all():
             return fit
-        held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, T_map_predicted, fit.seen))
+        elsewhere = self._observed_elsewhere(scan, fit, expected, usual_slope)
+        if elsewhere is not None:
+            return elsewhere
+        held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, expected, fit.seen))
         there, _ = self.map.polish(scan, held, usual_slope)
         if there.seen is None:
             return replace(held, seen=fit.seen)
         if there.seen.observed.all():
             return there
-        if there.rms > WORSE * fit.rms:
+        if there.rms > WORSE * max(fit.rms, FINEST):
             return replace(fit, seen=fit.seen.as_observed())
-        return replace(there, T_map_scan=self.motion.combined(there.T_map_scan, T_map_predicted, there.seen))
+        return replace(there, T_map_scan=self.motion.combined(there.T_map_scan, expected, there.seen))
 
-    def _accept(self, index: int, scan: PreparedScan, T_map_predicted: np.ndarray, fit: Fit) -> None:
+    def _observed_elsewhere(self, scan: PreparedScan, fit: Fit, expected: Expected, slope: float) -> Fit | None:
+        """A pose found from further off that fits about as well and leaves nothing open.
+
+        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing.
+        """
+        other = self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)
+        if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
+            return None
+        if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
+            return None
+        other, _ = self.map.polish(scan, other, slope)
+        return other if other.seen is not None and other.seen.observed.all() else None
+
+    def _accept(self, index: int, scan: PreparedScan, expected: Expected, fit: Fit) -> None:
         """Take the fit as the pose, and the scan into the map where it has moved on or the map has grown stale."""
         assert self.motion
-        if len(self.motion.T_map_last) > 1:
-            self.errors.append(displacement(fit.T_map_scan, T_map_predicted, scan.points))
+        if self.motion.begun:
+            self.errors.append(displacement(fit.T_map_scan, expected.T_map_scan, scan.points))
         self.usual.append((fit.overlap, fit.total))
         self.aligned, self.uncertain = self.aligned + 1, 0
-        self.motion.advance(fit.T_map_scan, T_map_predicted, fit.seen)
+        self.motion.advance(fit.T_map_scan, expected, fit.seen)
         self.last = (index, scan, fit.T_map_scan)
         self.best_total = min(self.best_total, fit.total)
         moved = displacement(fit.T_map_scan, self.map.keyframes[-1].T_map_scan, scan.points)
@@ -192,33 +261,37 @@ class Odometry:
             self.map.insert(index, scan, fit.T_map_scan)
             self.best_total = np.inf
 
-    def _bridge(
-        self,
-        index: int,
-        scan: PreparedScan | None,
-        T_map_predicted: np.ndarray,
-        fit: Fit,
-        feature_errors: FeatureErrors,
-    ) -> Frame:
-        """Go on at the prediction; where that lasts, with a new map."""
+    def _bridge(self, index: int, scan: PreparedScan | None, expected: Expected, fit: Fit) -> Frame:
+        """Go on at the prediction; where that lasts, with a new map, or elsewhere in the known one."""
         self.aligned, self.uncertain = 0, self.uncertain + 1
         assert self.motion
-        self.motion.advance(T_map_predicted, T_map_predicted, None)
+        T_map_scan = expected.T_map_scan
+        self.motion.advance(T_map_scan, expected, None)
         if scan is not None:
-            self.last = (index, scan, T_map_predicted)
-            if self.uncertain >= LOST_AFTER:  # the old map is out of sight: what follows is at least right in itself
-                self.map, self.uncertain, self.best_total = LocalMap(), 0, np.inf
-                self.map.insert(index, scan, T_map_predicted)
-                self.usual.clear()
-                self.motion.forget_place()
-        T_first_scan = self.frame.pose_to_file(T_map_predicted)
-        return Frame(T_first_scan, "uncertain", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+            self.last = (index, scan, T_map_scan)
+            if self.uncertain >= LOST_AFTER:
+                self._begin_again(index, scan)
+        T_first_scan = self.frame.pose_to_file(self.motion.T_map_scan)
+        return Frame(T_first_scan, "uncertain", fit.overlap, fit.rms * self.frame.voxel, fit.start)
 
-    def _frame(self, scan: PreparedScan, fit: Fit, feature_errors: FeatureErrors) -> Frame:
+    def _begin_again(self, index: int, scan: PreparedScan) -> None:
+        """The old map is out of sight: what follows is at least right in itself. A known map is looked for."""
+        assert self.motion
+        T_map_scan = self.motion.T_map_scan
+        if self.known:
+            found, _ = self.known.locate(scan)
+            T_map_scan = T_map_scan if found is None else found
+        self.map, self.uncertain, self.best_total = LocalMap(self.known), 0, np.inf
+        self.map.insert(index, scan, T_map_scan)
+        self.usual.clear()
+        self.motion.forget_place(T_map_scan)
+        self.last = (index, scan, T_map_scan)
+
+    def _frame(self, fit: Fit) -> Frame:
         """What came of a scan that fits."""
         assert self.motion
         T_first_scan = self.frame.pose_to_file(fit.T_map_scan)
-        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start, feature_errors)
+        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start)
         if fit.seen is None or fit.seen.observed.all():
             return found
         rotation, shift = self.motion.sigma(fit.seen.centre)
@@ -233,7 +306,7 @@ class Odometry:
     def T_map_scan(self) -> np.ndarray:  # noqa: N802
         """(4, 4): the last frame's pose."""
         assert self.motion
-        return self.motion.T_map_last[-1]
+        return self.motion.T_map_scan
 
     def state(self) -> dict[str, Any]:
         """What ``restore`` needs besides every frame's T_map_scan; JSON types."""
@@ -255,7 +328,7 @@ class Odometry:
 
         T_map_scan: (4, 4) of every frame so far; load: gives a frame's scan as it was registered.
         """
-        self.index, self.motion = len(T_map_scan), MotionModel.restored(state["motion"], T_map_scan[-2:])
+        self.index, self.motion = len(T_map_scan), MotionModel.restored(state["motion"])
         self.aligned, self.uncertain, self.best_total = state["aligned"], state["uncertain"], state["best_total"]
         self.errors.extend(state["errors"])
         self.usual.extend((overlap, total) for overlap, total in state["usual"])

@@ -17,9 +17,11 @@ class SequenceOptions:
     """How to register a sequence. Lengths are in the scans' own unit; None means: taken from the data.
 
     format: of the file of poses. camera_frame: poses of the camera that ``calib.txt`` tells of, as KITTI's own truth.
-    voxel_size: the working voxel edge. merged_voxel: the map's voxel edge, or None: half the working one.
+    voxel_size: a wish for the working voxel edge, which follows from the first scan's density, within a factor of 1.25.
+    merged_voxel: the map's voxel edge, or None: half the working one.
     loop_closure: at the end, recognise places seen before and optimise the pose graph.
     deskew: undo the motion within each scan, by the times of its points; its pose is that of the middle of the scan.
+    None: where the first scan's points have times.
     Raises FmrError for a format that is not known, and for a voxel edge that is no positive number.
     """
 
@@ -28,7 +30,7 @@ class SequenceOptions:
     voxel_size: float | None = None
     merged_voxel: float | None = None
     loop_closure: bool = False
-    deskew: bool = False
+    deskew: bool | None = None
 
     def __post_init__(self) -> None:
         if self.format not in FORMATS:

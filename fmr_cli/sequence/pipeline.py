@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +20,19 @@ import numpy as np
 import fmr_cli
 from fmr_cli.cloud import PointCloud, angle_degrees
 from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
+from fmr_cli.io import read_cloud
+from fmr_cli.multiway.known import KnownPose
 from fmr_cli.multiway.pose_graph import check_installed
 from fmr_cli.sequence.deskew import scan_times
 from fmr_cli.sequence.journal import Beginning, Journal
+from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.loader import Loader
 from fmr_cli.sequence.loop_closure import close_loops
 from fmr_cli.sequence.odometry import Frame, Odometry
 from fmr_cli.sequence.options import SequenceOptions
 from fmr_cli.sequence.outputs import Outputs
 from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
+from fmr_cli.sequence.priors import Priors
 from fmr_cli.sequence.result import SequenceResult
 from fmr_cli.sequence.scans import Scans, as_scans
 from fmr_cli.sequence.voxel_frame import VoxelFrame
@@ -35,27 +42,38 @@ OnRow = Callable[[dict[str, Any], int, int], None]
 
 def align_sequence(
     scans: Scans | str | Path | Iterable[str | Path | PointCloud], out: Path | None = None,
-    options: SequenceOptions = SequenceOptions(), *, residuals: Path | None = None, merged: Path | None = None,
+    options: SequenceOptions = SequenceOptions(), *, init_poses: Mapping[str, KnownPose] | None = None,
+    known_map: Path | PointCloud | None = None, residuals: Path | None = None, merged: Path | None = None,
     resume: bool = False, on_row: OnRow | None = None,
 ) -> SequenceResult:  # fmt: skip
-    """Register every scan into the frame of the first.
+    """Register every scan into the frame of the first, or into a known map.
 
     scans: a folder, a KITTI sequence or drive, a text file that lists scans (see ``find_scans``), or files or clouds in
-    their order. out: the file of poses, written as they are made; a journal beside it lets ``resume`` go on after a
-    kill, to the same poses. residuals: a CSV row a frame. merged: the map, a point a voxel. Nothing is written where no
-    file is named. on_row: called with each new row, how many rows there are now, and of how many.
+    their order. init_poses: poses known beforehand (T_world_scan) by scan, in any world of their own; the motions
+    between them are what is expected, and followed along directions that scans don't observe. known_map: poses are then
+    those in this map; the first scan is found in it by registration, or near its pose of ``init_poses``, whose world
+    is the map's.
+    out: the file of poses, written as they are made; a journal beside it lets ``resume`` go on after a kill, to the
+    same poses. residuals: a CSV row a frame. merged: the map, a point a voxel. Nothing is written where no file is
+    named. on_row: called with each new row, how many rows there are now, and of how many.
     Raises FmrError where the options ask for what the scans do not have, or a journal was begun otherwise;
     RegistrationError where the first scan cannot be used. A later scan that cannot be used is bridged.
     """
     scans = as_scans(scans)
-    check(scans, options, out, resume)
-    journal = Journal(out, settings(scans, options))
-    beginning, done = (journal.read() if resume else None) or (begin(scans, options), [])
+    known_cloud = read_cloud(known_map, attributes=False) if isinstance(known_map, Path) else known_map
+    check(scans, options, out, resume, known_cloud)
+    strict = options.deskew is True  # else a later scan without times is taken as it is
+    options = replace(options, deskew=has_times(scans) if options.deskew is None else options.deskew)
+    journal = Journal(out, settings(scans, options, init_poses or {}, known_cloud))
+    beginning, done = (journal.read() if resume else None) or (begin(scans, options, known_cloud), [])
 
     rows: list[dict[str, Any]] = []
     poses: list[np.ndarray] = []  # T_first_scan of every frame so far; the loader deskews by the last two
-    loader = Loader(scans, beginning, poses, deskewed=options.deskew, keep_clouds=merged is not None)
-    odometry = Odometry(beginning.frame)
+    loader = Loader(
+        scans, beginning, poses, deskewed=bool(options.deskew), strict=strict, keep_clouds=merged is not None
+    )
+    known = KnownMap((known_cloud.points - beginning.frame.of_map) / beginning.frame.voxel) if known_cloud else None
+    odometry, priors = Odometry(beginning.frame, known), Priors(scans, init_poses or {}, beginning.frame)
     go_on(done, rows, poses, loader, odometry)
 
     files = Outputs(
@@ -64,7 +82,12 @@ def align_sequence(
     with files, closing(loader.ahead(len(rows))) as loaded_scans:
         files.begin(beginning, done, rows, poses, loader)
         for loaded in loaded_scans:
-            frame, seconds = timed(odometry.register, loaded.scan, scans.where(loaded.index))
+            if known and loaded.index == 0:
+                register = partial(odometry.begin_in_map, loaded.scan, priors.first())
+            else:
+                told, pace = priors.motion(loaded.index), scans.pace(loaded.index)
+                register = partial(odometry.register, loaded.scan, told, pace)
+            frame, seconds = timed(register, scans.where(loaded.index))
             poses.append(frame.T_first_scan)
             rows.append(loaded.row | described(frame, poses) | {"register_s": seconds})
             state = {"size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(), "state": odometry.state()}
@@ -72,28 +95,44 @@ def align_sequence(
             if on_row:
                 on_row(rows[-1], len(rows), len(scans))
 
-        path, loops = np.stack(poses), 0
+        path, loops = np.stack(poses), tuple[tuple[int, int], ...]()
         if options.loop_closure:
             path, loops = close(path, rows, beginning.frame, loader)
         before = files.written(np.stack(poses)) if options.loop_closure else None
-        result = SequenceResult(files.written(path), rows, beginning.frame.voxel, before, loops, out)
+        result = SequenceResult(files.written(path), rows, beginning.frame.voxel, before, len(loops), out, loops)
         files.finish(result, path, loader)
     return result
 
 
-def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool) -> None:
+def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool, known_map: PointCloud | None) -> None:
     """Raises FmrError where the options ask for what is not there, before anything is read."""
     if options.camera_frame and scans.T_camera_scan is None:
         raise FmrError(f"{scans.where(0)}: no calib.txt with a line Tr beside it, leave out --camera-frame")
+    if options.loop_closure and known_map:
+        raise FmrError("--loop-closure: poses in a known map don't drift, leave out one of them")
     if options.loop_closure:
         check_installed("--loop-closure")
     if resume and (out is None or any(scans.path(i) is None for i in range(len(scans)))):
         raise FmrError("resume needs a file of poses, and scans in files; leave it out")
 
 
-def settings(scans: Scans, options: SequenceOptions) -> dict[str, Any]:
+def has_times(scans: Scans) -> bool:
+    """Whether the first scan's points have times that differ; what is wrong with it is said by whoever needs it."""
+    try:
+        scan_times(scans.read(0, attributes=True))
+    except CloudFileError:
+        return False
+    return True
+
+
+def settings(
+    scans: Scans, options: SequenceOptions, init_poses: Mapping[str, KnownPose], known_map: PointCloud | None
+) -> dict[str, Any]:
     """What must be the same in the run that is resumed."""
+    told = [[k, p.T_world_scan.tolist(), p.sigma_rot_deg, p.sigma_shift] for k, p in init_poses.items()]
     return {
+        "init_poses": sha256(repr(told).encode()).hexdigest() if told else None,
+        "map": [str(known_map.path), len(known_map)] if known_map else None,
         "version": fmr_cli.__version__,
         "files": [scans.where(index) for index in range(len(scans))],
         "voxel_size": options.voxel_size,
@@ -101,21 +140,23 @@ def settings(scans: Scans, options: SequenceOptions) -> dict[str, Any]:
     }
 
 
-def begin(scans: Scans, options: SequenceOptions) -> Beginning:
+def begin(scans: Scans, options: SequenceOptions, known_map: PointCloud | None) -> Beginning:
     """What follows from the first scan, and for deskewing from the first two. Raises CloudFileError."""
     try:
-        cloud = scans.read(0, attributes=options.deskew)
+        cloud = scans.read(0, attributes=bool(options.deskew))
     except CloudFileError as error:
         raise CloudFileError(f"{error}; or leave this first scan out with --start") from None
     if options.deskew:
         scan_times(cloud)  # says before anything is written that points have no times
-    frame = VoxelFrame(options.voxel_size or choose_voxel(cloud.points), np.median(cloud.points, axis=0))
+    origin = np.median(cloud.points, axis=0)
+    map_origin = np.median(known_map.points, axis=0) if known_map else origin
+    frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size), origin, map_origin)
     return Beginning(frame, first_motion(scans, frame) if options.deskew else np.eye(4))
 
 
 def first_motion(scans: Scans, frame: VoxelFrame) -> np.ndarray:
     """T_first_second (4, 4), file units, by the two scans as they are, which are skewed alike."""
-    odometry = Odometry(frame)
+    odometry = Odometry(replace(frame, map_origin=None))
     try:
         pair = [prepare_scan(scans.read(index, attributes=False).points, frame) for index in (0, 1)]
         _, second = [odometry.register(scan) for scan in pair]
@@ -137,11 +178,11 @@ def go_on(
     odometry.restore(done[-1]["state"], T_map_scan, loader.scan)
 
 
-def timed(register: Callable[[Any], Frame], scan: Any, name: str) -> tuple[Frame, float]:
+def timed(register: Callable[[], Frame], name: str) -> tuple[Frame, float]:
     """The frame and the seconds it took. Raises RegistrationError with the scan's name."""
     start = time.perf_counter()
     try:
-        return register(scan), round(time.perf_counter() - start, 4)
+        return register(), round(time.perf_counter() - start, 4)
     except RegistrationError as error:
         raise RegistrationError(f"{name}: {error}") from None
 
@@ -168,8 +209,10 @@ def six_digits(value: float | np.floating) -> float:
 
 def close(
     T_first_scan: np.ndarray, rows: list[dict[str, Any]], frame: VoxelFrame, loader: Loader
-) -> tuple[np.ndarray, int]:
-    """The path (n, 4, 4) with its loops closed, and how many there were."""
+) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
+    """The path (n, 4, 4) with its loops closed, and the frames that each of them joins."""
     sure = np.array([row["status"] == "aligned" for row in rows])
     closed, loops = close_loops(np.stack([frame.pose_to_voxels(T) for T in T_first_scan]), sure, loader.scan)
-    return np.stack([frame.pose_to_file(T_map_scan) for T_map_scan in closed]), len(loops)
+    return np.stack([frame.pose_to_file(T_map_scan) for T_map_scan in closed]), tuple(
+        (loop.earlier, loop.later) for loop in loops
+    )

@@ -27,9 +27,13 @@ BANDS = 8  # of equal count by range from the sensor
 
 
 class PlaneMap:
-    """Sums of points and normals by voxel; a point looks for the nearest mean."""
+    """Sums of points and normals by voxel; a point looks for the nearest mean.
 
-    def __init__(self) -> None:
+    two_sided: the normals' sides mean nothing, as in a map whose sensor's places are not known.
+    """
+
+    def __init__(self, two_sided: bool = False) -> None:
+        self.two_sided = two_sided
         self.keys = np.zeros(0, np.int64)  # of the voxels, sorted
         self.sums = np.zeros((0, 7))  # count, points, normals
         self.tree: small_gicp.KdTree | None = None
@@ -49,9 +53,15 @@ class PlaneMap:
         self.tree = None
 
     def fit(
-        self, points: np.ndarray, normals: np.ndarray, ranges: np.ndarray, T: np.ndarray, slope: float
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        ranges: np.ndarray,
+        solid: np.ndarray,
+        T: np.ndarray,
+        slope: float,
     ) -> tuple[np.ndarray, float, float, Matches | None]:
-        """The pose near T of points with unit normals (N, 3), seen at ranges (N,).
+        """The pose near T of points with unit normals (N, 3), seen at ranges (N,); a normal is right where solid (N,).
 
         slope: how residuals grow with range in this sensor's scans, see ``trust``. Returns the pose, the RMS distance
         from the planes, this scan's own slope, and what was matched; T as it was, NaN and None where too few points lie
@@ -70,11 +80,13 @@ class PlaneMap:
         for _ in range(ROUNDS):
             found, squared = self.tree.batch_nearest_neighbor_search(transform_points(T, points))
             plane = np.array(found)
-            on = (np.array(squared) < REACH**2) & self.flat[plane]
-            on &= np.einsum("ij,ij->i", self.normals[plane], normals @ T[:3, :3].T) > AGREE
+            on = solid & (np.array(squared) < REACH**2) & self.flat[plane]
+            cosine = np.einsum("ij,ij->i", self.normals[plane], normals @ T[:3, :3].T)
+            on &= (np.abs(cosine) if self.two_sided else cosine) > AGREE
             if on.sum() < 6 * BANDS:
                 return T, float("nan"), float("nan"), None
-            p, n, offset, b = points[on], self.normals[plane[on]], self.means[plane[on]], band[on]
+            p, offset, b = points[on], self.means[plane[on]], band[on]
+            n = self.normals[plane[on]] * np.sign(cosine[on])[:, None]
             for again in range(STEPS):
                 moved = transform_points(T, p)
                 r, J = linearise(moved, offset, n, np.zeros(3))

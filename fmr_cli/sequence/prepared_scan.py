@@ -19,9 +19,18 @@ if TYPE_CHECKING:
 # gains nothing measurable.
 WORKING_POINTS = 12_000
 POINTS_PER_VOXEL = 4  # of a scan that has few points, on average: finer voxels would hold no surface
-NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice
+NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice ...
+MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that these are mostly points of one ring
+# A neighbourhood is a line where its second principal variance is less than so much of the first: any normal across it
+# would do, and the one that noise picks is the scanner's pattern, which holds the scan where the map's keyframe stood.
+LINE = 0.1
+SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from which more neighbours are asked
 TILT = 3.0  # times the scan's median error, at which a normal is half trusted
+FEW = 512  # points that a scan's global feature is made of: enough to tell poses apart, 2 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
+# Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
+# no surface, and on coarser ones a scan slides.
+HINT = 1.25
 STEPS = 6  # of the search for the voxel, at most; each brings the count within a few percent
 COUNT_TOLERANCE = 0.1  # share by which the count may miss WORKING_POINTS
 # The count goes with the edge to the power of -1.5 to -2 (the rings of a LiDAR, a surface): -1 / 0.6 lies in between.
@@ -31,16 +40,23 @@ EDGE_PER_COUNT = 0.6
 class PreparedScan:
     """A scan in voxels: thinned ``points`` (N, 3), unit ``normals`` towards the sensor, ``ranges`` (N,) from it.
 
-    ``cloud`` is the same for small_gicp, with a covariance per point.
+    ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``cloud`` is the same for
+    small_gicp, with a covariance per point.
     """
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray) -> None:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels."""
         # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
         self.cloud = small_gicp.PointCloud(small_gicp.voxelgrid_sampling(points, 1.0).points())
-        small_gicp.estimate_normals_covariances(self.cloud, num_neighbors=NEIGHBOURS)
+        tree = small_gicp.KdTree(self.cloud)
+        small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=NEIGHBOURS)
         self.points = self.cloud.points()[:, :3]
         self.normals = self.cloud.normals()[:, :3]
+        self.solid = ~lines(self.points, tree, NEIGHBOURS)
+        if self.solid.mean() < 1 - SPARSE and len(self.points) > MANY_NEIGHBOURS:
+            small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
+            self.normals = np.where(self.solid[:, None], self.normals, self.cloud.normals()[:, :3])
+            self.solid[~self.solid] = ~lines(self.points, tree, MANY_NEIGHBOURS, np.flatnonzero(~self.solid))
         rays = self.points - sensor
         self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
         self.ranges = np.linalg.norm(rays, axis=1)
@@ -64,11 +80,44 @@ class PreparedScan:
         return 1 / (1 + (tilt2 / (TILT**2 * np.median(tilt2))) ** 2)
 
     @cached_property
+    def few(self) -> np.ndarray:
+        """(M, 3): FEW of the points, or all where there are fewer."""
+        return self.points[np.sort(np.random.default_rng(0).permutation(len(self.points))[:FEW])]
+
+    @cached_property
+    def box(self) -> tuple[np.ndarray, float]:
+        """Centre (3,) of the few points, and the radius about it that holds them all, voxels."""
+        centre = self.few.mean(0)
+        return centre, float(np.linalg.norm(self.few - centre, axis=1).max())
+
+    @cached_property
+    def feature(self) -> np.ndarray:
+        """(d,), the global feature of the few points in their box."""
+        from fmr_cli.registration.models import fast_encoder
+
+        centre, unit = self.box
+        return fast_encoder()(((self.few - centre) / unit).astype(np.float32))
+
+    @cached_property
     def for_align(self) -> Prepared:
         """The scan as feature-metric registration takes it, which encodes it once."""
         from fmr_cli.registration.pipeline import prepare
 
         return prepare(PointCloud(self.points))
+
+
+def lines(points: np.ndarray, tree: small_gicp.KdTree, count: int, which: np.ndarray | None = None) -> np.ndarray:
+    """Whether the ``count`` nearest neighbours of points (N, 3), or of some of them, lie on a line.
+
+    By the invariants of their covariance: the sum of its principal minors over its squared trace is r / (1 + r)² for
+    principal variances 1, r, 0.
+    """
+    asked = points if which is None else points[which]
+    near = points[tree.batch_knn_search(asked, count)[0].astype(np.int64)]
+    x, y, z = (near - near.mean(1, keepdims=True)).transpose(2, 0, 1)
+    xx, yy, zz, xy, xz, yz = (np.einsum("ij,ij->i", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
+    minors = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
+    return minors < LINE / (1 + LINE) ** 2 * (xx + yy + zz) ** 2
 
 
 def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
@@ -79,10 +128,11 @@ def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
     return scan if len(scan) >= MIN_POINTS else None
 
 
-def choose_voxel(points: np.ndarray) -> float:
+def choose_voxel(points: np.ndarray, wish: float | None = None) -> float:
     """The voxel edge that thins points (N, 3) to WORKING_POINTS, or to a quarter of them where they are few.
 
-    In the points' unit, to two digits. Raises RegistrationError where all points are in one place.
+    In the points' unit, to two digits. wish: an edge to be near to, within HINT. Raises RegistrationError where all
+    points are in one place.
     """
     wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
@@ -94,4 +144,6 @@ def choose_voxel(points: np.ndarray) -> float:
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
+    if wish is not None:
+        return float(np.clip(wish, voxel / HINT, voxel * HINT))
     return float(f"{voxel:.2g}")

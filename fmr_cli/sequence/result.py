@@ -20,7 +20,8 @@ class SequenceResult:
     rotation_deg, seconds, and a message where something was wrong with the scan; where directions were not observed,
     unobserved (in words), and sigma_shift and sigma_rotation_deg, how far off the pose may be along them.
     voxel_size: the working voxel edge, file units. odometry_poses: (n, 4, 4) before loops were closed, or None where
-    that was not asked for; loops: how many were closed. out: the file of poses, or None.
+    that was not asked for; loops: how many were closed; closed: the frames that each of them joins. out: the file of
+    poses, or None.
     """
 
     poses: np.ndarray
@@ -29,6 +30,7 @@ class SequenceResult:
     odometry_poses: np.ndarray | None = None
     loops: int = 0
     out: Path | None = None
+    closed: tuple[tuple[int, int], ...] = ()
 
     @property
     def status(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -12,8 +11,9 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
-from fmr_cli.io import SUFFIXES, read_cloud
+from fmr_cli.io import SUFFIXES, holds_scans, read_cloud, scan_paths, scans_of
 from fmr_cli.io.files import check_readable
+from fmr_cli.io.folders import natural, stem, times_by_name
 from fmr_cli.io.transforms import as_transform, number_rows
 
 TEXT = {".txt", ".csv"}  # beside scans of another format these are poses, times, tables
@@ -25,7 +25,7 @@ class Scans:
 
     sources: files, or clouds in memory; ``chosen`` are their places among all ``total``. times: (n,), one a scan,
     seconds, or None. T_camera_scan: (4, 4), calib.txt's Tr, or None. notes: what a person should know about the choice,
-    a line each.
+    a line each. every: all the files, where only some are chosen.
     """
 
     sources: list[Path | PointCloud]
@@ -34,6 +34,12 @@ class Scans:
     times: np.ndarray | None = None
     T_camera_scan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+    every: list[Path] = field(default_factory=list)
+
+    @property
+    def all_sources(self) -> list[Path | PointCloud]:
+        """Those of all ``total`` scans."""
+        return list(self.every) or self.sources
 
     def __len__(self) -> int:
         return len(self.sources)
@@ -52,6 +58,13 @@ class Scans:
         """One scan. Raises CloudFileError."""
         source = self.sources[index]
         return source if isinstance(source, PointCloud) else read_cloud(source, attributes=attributes)
+
+    def pace(self, index: int) -> float:
+        """The time from the scan before to this one, over that before it; 1 where it is not known."""
+        if self.times is None or index < 2:
+            return 1.0
+        before, after = np.diff(self.times[index - 2 : index + 1])
+        return float(after / before) if before else 1.0
 
     def where(self, index: int) -> str:
         """The scan's path, or what stands for it in a message."""
@@ -76,14 +89,18 @@ def as_scans(scans: Scans | str | Path | Iterable[str | Path | PointCloud]) -> S
 def find_scans(
     path: Path, start: int = 0, stop: int | None = None, step: int = 1, outputs: Iterable[Path] = ()
 ) -> Scans:
-    """The scans of a folder, of a KITTI odometry sequence, of a KITTI raw drive, or of a text file that lists them.
+    """The scans of a folder, of a KITTI odometry sequence, of a KITTI raw drive, of a bag (or another file that holds
+    several), or of a text file that lists them.
 
     start, stop, step: as in a slice, counted over all scans. outputs: files that are no scans, wherever they lie.
     Raises CloudFileError where there are fewer than two.
     """
     notes: list[str] = []
     home = path
-    if path.is_dir():
+    in_file = holds_scans(path)
+    if in_file:
+        files = scan_paths(path)
+    elif path.is_dir():
         folder = next((f for f in (path / "velodyne", path / "velodyne_points" / "data") if f.is_dir()), path)
         home = path.parent if folder is path and path.name == "velodyne" else path
         files = in_folder(folder, {p.resolve() for p in outputs}, notes)
@@ -91,14 +108,16 @@ def find_scans(
         files = in_list(path)
     else:
         check_readable(path)
-        raise CloudFileError(f"{path}: is one file, give a folder of scans, or a .txt that lists them")
+        raise CloudFileError(f"{path}: is one file, give a folder of scans, a bag, or a .txt that lists them")
     chosen = range(len(files))[start:stop:step]
     if len(chosen) < 2:
         what = f"{len(files)} scans, {len(chosen)} of them chosen" if len(chosen) < len(files) else "one scan only"
         raise CloudFileError(f"{path}: {what}, a sequence has two or more (formats: {' '.join(SUFFIXES)})")
-    times = read_times(home, len(files)) if path.is_dir() else None
-    times = None if times is None else times[np.array(chosen)]
-    return Scans([files[i] for i in chosen], chosen, len(files), times, read_calibration(home), notes)
+    times = read_times(home, len(files)) if path.is_dir() and not in_file else None
+    if times is None:
+        times = times_by_name([part.name for part in scans_of(path)] if in_file else [stem(file) for file in files])
+    times = None if times is None else in_order(times[np.array(chosen)], [files[i] for i in chosen], notes)
+    return Scans([files[i] for i in chosen], chosen, len(files), times, read_calibration(home), notes, files)
 
 
 def in_folder(folder: Path, outputs: set[Path], notes: list[str]) -> list[Path]:
@@ -112,7 +131,19 @@ def in_folder(folder: Path, outputs: set[Path], notes: list[str]) -> list[Path]:
     if len(count) > 1:
         others = ", ".join(f"{n} {s}" for s, n in sorted(count.items()) if s != suffix)
         notes.append(f"{folder}: two formats, the {count[suffix]} {suffix} files are taken, {others} left out")
-    return sorted((p for p in found if p.suffix.lower() == suffix), key=natural)
+    return sorted((p for p in found if p.suffix.lower() == suffix), key=lambda file: natural(stem(file)))
+
+
+def in_order(times: np.ndarray, files: list[Path], notes: list[str]) -> np.ndarray | None:
+    """The times (n,), or None where they run to and fro: then they say nothing about the motion between scans."""
+    back = np.flatnonzero(~(np.diff(times) >= 0) != ~(times[-1] >= times[0]))
+    if len(back):
+        notes.append(
+            f"{files[back[0] + 1]}: time runs the other way there than from the first scan to the last, so the times "
+            "are not used; check the order of the scans"
+        )
+        return None
+    return times
 
 
 def in_list(path: Path) -> list[Path]:
@@ -128,11 +159,6 @@ def in_list(path: Path) -> list[Path]:
         what = f"lists {missing}, which is not there" if missing else "lists no scans"
         raise CloudFileError(f"{path}: {what}, name one scan file a line")
     return files
-
-
-def natural(path: Path) -> list[tuple[int, int | str]]:
-    """A key that puts 2.ply before 10.ply."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"([0-9]+)", path.name) if part]
 
 
 def read_times(home: Path, count: int) -> np.ndarray | None:

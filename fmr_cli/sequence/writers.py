@@ -12,7 +12,7 @@ import numpy as np
 
 import fmr_cli
 from fmr_cli.io.files import atomic_write
-from fmr_cli.io.outputs import write_json
+from fmr_cli.io.outputs import cell, write_json
 from fmr_cli.sequence.options import Format
 
 COLUMNS = (
@@ -104,7 +104,7 @@ def numbers(values: Iterable[float]) -> str:
 
 def csv_line(row: dict[str, Any]) -> str:
     text = StringIO()
-    csv.writer(text, lineterminator="\n").writerow([row.get(name, "") for name in COLUMNS])
+    csv.writer(text, lineterminator="\n").writerow([cell(row.get(name, "")) for name in COLUMNS])
     return text.getvalue()
 
 

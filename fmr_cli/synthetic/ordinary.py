@@ -124,6 +124,8 @@ DEGENERATE: dict[str, Maker] = {
 
 # Shy: right, but by little.
 
+CARVED = 0.6  # of the objects have small things all over
+
 
 def band(make: Callable[[np.random.Generator, float], tuple[Scan, Scan]], low: float, high: float) -> Maker:
     """A maker of pairs with an overlap (the smaller of the two scans' shares) from low to high.
@@ -191,11 +193,23 @@ def street_views(low: float, high: float) -> Maker:
     return maker
 
 
+def carve(s: Structure, rng: np.random.Generator) -> None:
+    """Covers an object with small things, as a figure or a casting is."""
+    bodies = [A[:3, :4] for A in s.scene.maps]
+    for _ in range(rng.integers(20, 80)):
+        body, u = bodies[rng.integers(len(bodies))], rng.normal(size=3)
+        at = body[:, :3] @ (u / np.linalg.norm(u)) + body[:, 3]  # on a ball's surface, just below a cube's faces
+        half = log_uniform(rng, 0.02, 0.08) * rng.uniform(0.5, 1.5, 3)
+        s.add(int(rng.choice([CUBE, BALL, CYLINDER])), at, half, Rotation.random(random_state=rng))
+
+
 def object_views(low: float, high: float) -> Maker:
     """One to three depth views each of an object, from directions 15 to 130 deg apart."""
 
     def maker(rng: np.random.Generator) -> Draft:
-        s, views, width = lump(rng), int(rng.integers(1, 4)), int(rng.integers(70, 120))
+        s, views, width = lump(rng), int(rng.integers(1, 4)), int(log_uniform(rng, 70, 300))
+        if rng.random() < CARVED:
+            carve(s, rng)
         towards, axis = sensors.all_round(1, rng)[0], sensors.all_round(1, rng)[0]
         axis = np.cross(towards, axis) / np.linalg.norm(np.cross(towards, axis))
         spread = rng.normal(0, 0.25, (2, views, 3)) * (np.arange(views) > 0)[:, None]

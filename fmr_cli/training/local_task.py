@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from fmr_cli.descriptors.patch_encoder import CHANNELS
 from fmr_cli.errors import ModelError
 from fmr_cli.training.local_views import Views
+from fmr_cli.training.losses import half_precision
 from fmr_cli.training.recipe import LocalRecipe
 from fmr_cli.training.run_folder import held
 from fmr_cli.training.task import Scores, Task, ramped_cosine
@@ -39,32 +40,36 @@ class LocalNet(nn.Module):
 
 
 def read_local_start(name: str) -> dict[str, Tensor] | None:
-    """The weights to start from: "scratch" is None, "base" the bundled ones, else a file. Raises ModelError."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    from fmr_cli.registration.models import bundled_local_path
+    """The weights to start from: "scratch" is None, "base" the bundled ones, else a file's. Raises ModelError."""
+    from fmr_cli.registration.models import model
 
     if name == "scratch":
         return None
-    try:
-        if name == "base":
-            with bundled_local_path() as path:
-                return load_file(path)
-        return load_file(name)
-    except FileNotFoundError:
-        raise ModelError(f"{name}: no such model file; give a .safetensors file written by `fmr train`") from None
-    except (SafetensorError, OSError) as error:
-        raise ModelError(f"{name}: not a safetensors file ({error}); give one written by `fmr train`") from None
+    found = model(None if name == "base" else name)
+    return {name: torch.from_numpy(array) for name, array in (found.weights.local or model().weights.local).items()}
 
 
-def info_nce(a: Tensor, b: Tensor, place: Tensor, temperature: float, apart: float) -> Tensor:
-    """InfoNCE of descriptors a, b (n, d) whose rows correspond; rows of places nearer than ``apart`` do not repel."""
-    logits = a @ b.T / temperature
-    close = (torch.cdist(place, place) < apart) & ~torch.eye(len(a), dtype=torch.bool, device=a.device)
-    logits = logits.masked_fill(close, EXCLUDED)
-    label = torch.arange(len(a), device=a.device)
-    return (nn.functional.cross_entropy(logits, label) + nn.functional.cross_entropy(logits.T, label)) / 2
+def info_nce(a: Tensor, b: Tensor, views: Views, temperature: float, apart: float) -> Tensor:
+    """InfoNCE of descriptors a (n, d), b (m, d) whose first ``views.common`` rows correspond.
+
+    What lies nearer to a patch's counterpart than ``apart``, or looks the same and lies elsewhere, does not repel.
+    """
+    n, losses = views.common, []
+    label = torch.arange(n, device=a.device)
+    for x, y, p, alias in ((a, b, views.place_target, views.alias), (b, a, views.place, views.alias_target)):
+        logits = x[:n] @ y.T / temperature
+        close = (torch.cdist(p[:n], p) < apart) | alias
+        close[label, label] = False
+        losses.append(nn.functional.cross_entropy(logits.masked_fill(close, EXCLUDED), label))
+    return (losses[0] + losses[1]) / 2
+
+
+def described(net: LocalNet, chosen: list[Views]) -> list[tuple[Tensor, Tensor]]:
+    """The descriptors of each pair's source and target, from one pass."""
+    with half_precision(chosen[0].source.device):
+        all_of_them = net(torch.cat([x for v in chosen for x in (v.source, v.target)])).float()
+    parts = iter(all_of_them.split([len(x) for v in chosen for x in (v.source, v.target)]))
+    return [(next(parts), next(parts)) for _ in chosen]
 
 
 class LocalTask(Task):
@@ -99,15 +104,12 @@ class LocalTask(Task):
         self.modules: dict[str, nn.Module] = {"local": self.net}
 
     def losses(self, step: int, steps: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """InfoNCE of a batch of pairs, the products in bfloat16."""
+        """InfoNCE of a batch of pairs."""
         order = torch.randperm(len(self.material), generator=generator, device=self.device)
         chosen = [self.material[int(i)] for i in order[: self.recipe.batch]]
-        with torch.autocast(self.device.type, torch.bfloat16):
-            described = self.net(torch.cat([x for v in chosen for x in (v.source, v.target)])).float()
-        parts = iter(described.split([len(v.place) for v in chosen for _ in range(2)]))
         temperature, apart = self.recipe.temperature, self.recipe.apart
-        each = [info_nce(next(parts), next(parts), v.place, temperature, apart) for v in chosen]
-        return {"info_nce": torch.stack(each).mean()}
+        pairs = zip(described(self.net, chosen), chosen, strict=True)
+        return {"info_nce": torch.stack([info_nce(a, b, v, temperature, apart) for (a, b), v in pairs]).mean()}
 
     def rate(self, step: int, steps: int) -> float:
         return ramped_cosine(step, 0, steps, self.recipe.learning_rate, ramp=1)
@@ -118,7 +120,7 @@ class LocalTask(Task):
         shares = []
         for views in self.held_out:
             nearest = (self.net(views.source) @ self.net(views.target).T).argmax(1)
-            off = (views.place[nearest] - views.place).norm(dim=1)
+            off = (views.place_target[nearest] - views.place).norm(dim=1)
             shares.append(float((off < self.recipe.apart).float().mean()))
         return {"same place": {RANK1: float(np.mean(shares))}}
 

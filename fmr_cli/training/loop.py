@@ -18,7 +18,7 @@ import torch
 
 from fmr_cli.training.processes import agreed, average_gradients, rank_and_world, wait_for_all
 from fmr_cli.training.run_folder import MODEL, RECIPE, Progress, RunFolder, TrainingError, parameters
-from fmr_cli.training.task import Task
+from fmr_cli.training.task import Show, Task
 
 MARGIN = 0.97  # of the minutes that were asked for are planned: the last test and the card take the rest
 TIMED = 20  # steps whose time the plan rests on: some seconds, over which a shared machine's speed evens out
@@ -26,7 +26,7 @@ TIMED = 20  # steps whose time the plan rests on: some seconds, over which a sha
 
 @dataclass
 class Report:
-    """What a step (or, with ``row``, an epoch) has to say. left: seconds, estimated."""
+    """What a step (or, with ``row``, an epoch) has to say. left: seconds, estimated. notes: for a person."""
 
     step: int
     steps: int
@@ -34,6 +34,7 @@ class Report:
     clouds_per_second: float
     left: float
     row: dict[str, Any] | None = None
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -72,18 +73,21 @@ class Trainer:
             self.progress = self.folder.load_state(task.modules, self.optimiser, self.device)
             self.progress.planned |= minutes is None
         self.begin = time.monotonic()
-        self.test_seconds = 0.0  # that the last test took
+        self.test_seconds = self.renewal_seconds = 0.0  # that the last test and the last renewal took
+        self.show: Show = lambda what, done, total: None
 
     def spent(self) -> float:
         """Seconds of training, those before a resumed state as well."""
         return time.monotonic() - self.begin
 
     def run(self) -> Iterator[Report]:
-        """Trains to the recipe's last step, or as far as the minutes go."""
+        """Trains to the recipe's last step, or as far as the minutes go, and checks what is kept."""
         progress = self.progress
         self.begin = time.monotonic() - progress.seconds
+        yield from self.renew()
         if not progress.scores:
             yield self.report(0.0, Epoch(), self.test({}))
+        self.task.start_scores = progress.scores.get("0", {})
         epoch, timed = Epoch(), Epoch()
         while progress.step < progress.steps:
             values = self.step()
@@ -91,15 +95,45 @@ class Trainer:
             timed.add({})
             if not progress.planned and timed.steps == TIMED:
                 self.plan(timed.step_seconds())
-            late = bool(agreed(self.minutes is not None and self.spent() > 60 * self.minutes, self.device))
+            late = bool(agreed(self.minutes is not None and self.spent() > self.training_seconds(), self.device))
             if progress.step % self.recipe.epoch_steps and progress.step < progress.steps and not late:
                 yield self.report(sum(values.values()), epoch)
-                continue
-            means = epoch.means()
-            yield self.report(sum(means.values()), epoch, self.test(means))
-            epoch = Epoch()
+            else:
+                means = epoch.means()
+                yield self.report(sum(means.values()), epoch, self.test(means))
+                epoch = Epoch()
             if late:
                 break
+            if progress.step < progress.steps:
+                yield from self.renew(epoch)
+        yield from self.check()
+
+    def renew(self, epoch: Epoch | None = None) -> Iterator[Report]:
+        """Lets the task gather more to learn from; an epoch's time does not count that."""
+        begin = time.monotonic()
+        notes = self.task.renew(self.progress.step, self.progress.steps, self.folder, self.show)
+        if notes:
+            self.renewal_seconds = time.monotonic() - begin
+            if epoch is not None:
+                epoch.begin += self.renewal_seconds
+            yield self.report(0.0, epoch or Epoch(), notes=notes)
+
+    def check(self) -> Iterator[Report]:
+        """The task's last test of what is kept, once."""
+        if self.progress.check is None:
+            if self.rank == 0:
+                seconds = None if self.minutes is None else max(60 * self.minutes - self.spent(), 0.0)
+                self.progress.check = self.task.check(self.folder, seconds, self.show)
+                self.progress.seconds = self.spent()
+                if self.progress.check is not None:
+                    self.save()
+                    yield self.report(0.0, Epoch(), notes=self.progress.check["said"])
+            wait_for_all()
+
+    def training_seconds(self) -> float:
+        """How long training may take of the minutes."""
+        assert self.minutes is not None
+        return 60 * self.minutes - self.task.closing_seconds(self.minutes)
 
     def step(self) -> dict[str, float]:
         """One step of Adam; the value of each loss. Raises TrainingError where one is not finite."""
@@ -127,7 +161,7 @@ class Trainer:
     def plan(self, step_seconds: float) -> None:
         """Fits the number of steps, and with it the learning rate's cosine, into the minutes."""
         assert self.minutes is not None
-        left = MARGIN * 60 * self.minutes - self.spent()
+        left = MARGIN * self.training_seconds() - self.spent() - self.task.renewals() * self.renewal_seconds
         each = step_seconds + self.test_seconds / self.recipe.epoch_steps
         steps = self.progress.step + max(int(left / each), 1)
         self.progress.steps = int(agreed(min(steps, self.recipe.steps), self.device))
@@ -136,16 +170,17 @@ class Trainer:
         if self.rank == 0:
             self.folder.write(RECIPE, self.recipe.toml())
 
-    def report(self, loss: float, epoch: Epoch, row: dict[str, Any] | None = None) -> Report:
+    def report(
+        self, loss: float, epoch: Epoch, row: dict[str, Any] | None = None, notes: list[str] | None = None
+    ) -> Report:
         """What there is to say after a step, or after an epoch, whose figures are ``row``."""
         progress, each = self.progress, epoch.step_seconds()
         left = each * (progress.steps - progress.step)
         if self.minutes is not None:
             in_time = max(60 * self.minutes - self.spent(), 0.0)
             left = min(left, in_time) if progress.planned else in_time
-        return Report(
-            progress.step, progress.steps, loss, self.world * self.task.clouds / each if each else 0.0, left, row
-        )
+        speed = self.world * self.task.clouds / each if each else 0.0
+        return Report(progress.step, progress.steps, loss, speed, left, row, notes or [])
 
     def test(self, losses: dict[str, float]) -> dict[str, Any]:
         """Tests on what is held out, keeps the weights where they are the best so far, writes metrics and state."""
@@ -155,6 +190,7 @@ class Trainer:
         if self.rank == 0:
             scores = self.task.test()
             progress.scores[str(progress.epoch)] = scores
+            self.task.start_scores = progress.scores["0"]
             early = progress.epoch == 0 or not self.task.may_choose(progress.step)
             if early or self.quality(progress.epoch) > self.quality(progress.best):
                 progress.best = progress.epoch
@@ -166,11 +202,15 @@ class Trainer:
                       for what, value in measures.items()}}  # fmt: skip
             self.folder.add_metrics(row)
             progress.epoch += 1
-            self.folder.save_state(self.task.modules, self.optimiser, progress, self.recipe.toml())
+            self.save()
         wait_for_all()
         progress.epoch += self.rank > 0
         self.test_seconds = time.monotonic() - begin
         return row
+
+    def save(self) -> None:
+        """Everything that the next step depends on."""
+        self.folder.save_state(self.task.modules, self.optimiser, self.progress, self.recipe.toml())
 
     def quality(self, epoch: int) -> tuple[float, ...]:
         """What the best epoch is chosen by."""

@@ -1,14 +1,14 @@
 """Every setting of a training run, as a TOML file that can be read back and run again.
 
-``kind`` says what is trained: "global", the encoder of whole clouds (Recipe), or "local", that of local patches
-(LocalRecipe).
+``kind`` says what is trained: "scans", all that registration uses, on the user's scans (ScanRecipe); "global", the
+encoder of whole clouds alone (Recipe); "local", that of local patches, on made-up scans (LocalRecipe).
 """
 
 from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -144,11 +144,88 @@ class Recipe:
         )
 
 
+@dataclass(frozen=True)
+class ScanRecipe:
+    """How registration goes on from the user's scans: its local encoder, and a share of the time its global one.
+
+    Lengths in voxel edges. whole: how the global encoder goes on.
+    """
+
+    kind: str = "scans"
+    start: str = "base"  # "base", "scratch" or a .safetensors file
+    rounds: int = 3  # of registering the scans with each other, by what has been learnt so far
+    scans: int = 40  # registered with each other in a round, at most
+    pairs: int = 160  # of them that show one place, drawn for training in a round, at most
+    single: int = 48  # pairs made from single scans, in a round
+    made_up: int = 96  # pairs of procedural scans, so that nothing is forgotten
+    patches: int = 96  # of one place, of each scan of a pair, at most
+    others: int = 48  # of each scan's patches that are in it alone
+    batch: int = 2  # pairs of a step
+    temperature: float = 0.07  # of InfoNCE
+    apart: float = 3.0  # voxel edges: nearer places are not each other's negatives
+    learning_rate: float = 5e-4  # twice as much gains a little more on the scans and forgets three times as much
+    whole_every: int = 5  # one step in so many is the global encoder's; 0 leaves it as it is
+    steps: int = 1200
+    epoch_steps: int = 100
+    seed: int = 0
+    held_out: float = 0.2  # share of the scans that are never trained on
+    tested: int = 12  # held-out pairs whose matches are counted after each epoch
+    checked: int = 48  # held-out pairs that are registered before and after, at most
+    whole: Recipe = field(default_factory=lambda: Recipe(crops=1024, decoder_warmup=100, held_out_pairs=12))
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            least = 1 if name in ("rounds", "scans", "patches", "batch", "steps", "epoch_steps", "tested") else 0
+            if isinstance(value, int | float) and not value >= least:
+                raise RecipeError(f"the recipe has {name} = {value}; give a larger number")
+        if not 0 < self.held_out < 1 or not self.temperature > 0:
+            raise RecipeError("the recipe needs held_out between 0 and 1, and a temperature above 0")
+        if self.scans < 2:
+            raise RecipeError("the recipe has scans = 1; give two or more")
+        if not self.pairs + self.single + self.made_up:
+            raise RecipeError("the recipe has no pairs; set pairs, single or made_up above 0")
+
+    def changed(self, **changes: Any) -> ScanRecipe:
+        """A copy with other values; those of the global encoder go there. Values of None are left as they are."""
+        given = {name: value for name, value in changes.items() if value is not None}
+        own = {f.name for f in fields(self)}
+        theirs = {n: v for n, v in given.items() if n not in own or n in ("start", "seed")}
+        return replace(self, whole=self.whole.changed(**theirs), **{n: v for n, v in given.items() if n in own})
+
+    def within(self, minutes: float) -> ScanRecipe:
+        """A copy whose material suits so many minutes; the global encoder has its share of longer runs alone."""
+        return replace(
+            self,
+            rounds=1 if minutes < 3 else 2 if minutes < 8 else 3,
+            scans=16 if minutes < 3 else 40,
+            pairs=_between(40 * minutes, 40, 240),
+            single=_between(12 * minutes, 12, 64),
+            made_up=_between(16 * minutes, 16, 96),
+            tested=8 if minutes < 3 else 12,
+            checked=_between(12 * minutes, 12, 60),
+            epoch_steps=50 if minutes < 3 else 100,
+            whole_every=0 if minutes < 3 else self.whole_every,
+        )
+
+    def toml(self) -> str:
+        """The recipe as TOML, every key of it."""
+        lines = [f"{f.name} = {_value(getattr(self, f.name))}" for f in fields(self) if f.name != "whole"]
+        whole = self.whole.toml().replace("[augment]", "[whole.augment]")
+        return "\n".join([*lines, "", "[whole]", whole])
+
+
+def _between(value: float, least: int, most: int) -> int:
+    return round(min(max(value, least), most))
+
+
+AnyRecipe = Recipe | LocalRecipe | ScanRecipe
+
+
 def _value(value: Any) -> str:
     return json.dumps(list(value) if isinstance(value, tuple) else value)
 
 
-def read_recipe(path: Path | str) -> Recipe | LocalRecipe:
+def read_recipe(path: Path | str) -> AnyRecipe:
     """Reads a TOML recipe; keys that it lacks keep their defaults. Raises RecipeError for what cannot be run."""
     path = Path(path)
     try:
@@ -164,12 +241,21 @@ def read_recipe(path: Path | str) -> Recipe | LocalRecipe:
         raise RecipeError(f"{path}: {error}") from None
 
 
-def _recipe(table: dict[str, Any]) -> Recipe | LocalRecipe:
+def _recipe(table: dict[str, Any]) -> AnyRecipe:
     kind = table.get("kind", "global")
-    if kind not in ("global", "local"):
-        raise RecipeError(f"kind must be 'global' or 'local', not {kind!r}")
+    if kind not in ("global", "local", "scans"):
+        raise RecipeError(f"kind must be 'scans', 'global' or 'local', not {kind!r}")
     if kind == "local":
         return LocalRecipe(**_checked(LocalRecipe, table))
+    if kind == "scans":
+        whole = table.pop("whole", {})
+        if not isinstance(whole, dict):
+            raise RecipeError("whole must be a table, [whole]")
+        return ScanRecipe(**_checked(ScanRecipe, table), whole=_whole(whole))
+    return _whole(table)
+
+
+def _whole(table: dict[str, Any]) -> Recipe:
     augment = table.pop("augment", {})
     if not isinstance(augment, dict):
         raise RecipeError("augment must be a table, [augment]")
@@ -178,11 +264,11 @@ def _recipe(table: dict[str, Any]) -> Recipe | LocalRecipe:
 
 def _checked(cls: type, table: dict[str, Any]) -> dict[str, Any]:
     """The table's values, each a key of the dataclass and of its default's type."""
-    defaults = {f.name: f.default for f in fields(cls)} | ({"augment": None} if cls is Recipe else {})
+    defaults = {f.name: f.default for f in fields(cls) if f.default is not MISSING}  # without tables of their own
     values = {}
     for name, value in table.items():
-        if name not in defaults or name == "augment":
-            raise RecipeError(f"unknown key {name!r}; known are {', '.join(k for k in defaults if k != 'augment')}")
+        if name not in defaults:
+            raise RecipeError(f"unknown key {name!r}; known are {', '.join(defaults)}")
         default: Any = defaults[name]
         if isinstance(default, float) and type(value) is int:
             value = float(value)

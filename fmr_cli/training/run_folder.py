@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from fmr_cli.errors import FmrError, ModelError
 from fmr_cli.io.files import atomic_write
-from fmr_cli.training.recipe import LocalRecipe, Recipe, read_recipe
+from fmr_cli.training.recipe import AnyRecipe, read_recipe
 from fmr_cli.training.task import Scores
 
 MODEL, STATE, RECIPE, METRICS, CARD = (
@@ -41,6 +41,7 @@ class Progress:
     seconds: float = 0.0
     scores: dict[str, Scores] = field(default_factory=dict)  # by epoch
     planned: bool = True  # whether ``steps`` fits the minutes that were asked for
+    check: dict[str, Any] | None = None  # what the last test of the kept model has given
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class RunFolder:
             reason = " ".join(str(error).split())[:200]
             raise ModelError(f"{path}: no state to resume ({reason}); run without --resume") from None
 
-    def saved_recipe(self) -> Recipe | LocalRecipe:
+    def saved_recipe(self) -> AnyRecipe:
         """The recipe of a run that is to be resumed. Raises FmrError where the folder holds none."""
         if not (self.path / STATE).is_file():
             raise TrainingError(f"{self.path}: holds no {STATE}, so there is no run to resume; run without --resume")

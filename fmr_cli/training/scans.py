@@ -120,11 +120,8 @@ def scene_crops(
     return found
 
 
-def load_pairs(path: Path, cloud_points: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Labelled pairs of a CSV file (source, target, transform; paths relative to it): two arrays (S, M, 3), float32.
-
-    The source is moved onto its target; both are centred on the target and scaled as one. Raises FmrError.
-    """
+def read_pairs(path: Path) -> list[tuple[Path, Path, np.ndarray]]:
+    """Labelled pairs of a CSV file: source, target (relative to it), T_target_source. Raises FmrError."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file, skipinitialspace=True))
@@ -134,14 +131,23 @@ def load_pairs(path: Path, cloud_points: int, seed: int) -> tuple[np.ndarray, np
         raise FmrError(f"{path}: is no CSV file ({error}); check how it was written") from None
     if not rows or not {"source", "target", "transform"} <= set(rows[0]):
         raise FmrError(f"{path}: needs a first line with the columns source, target, transform, and a line a pair")
-    rng = np.random.default_rng(seed)
-    sources: list[np.ndarray] = []
-    targets: list[np.ndarray] = []
     for number, row in enumerate(rows, 2):
         if not all(row[name] for name in ("source", "target", "transform")):
             raise FmrError(f"{path}: line {number} lacks source, target or transform; fill it in")
-        T = read_transform(path.parent / row["transform"])
-        source, target = (read_cloud(path.parent / row[name], attributes=False).points for name in ("source", "target"))
+    folder = path.parent
+    return [(folder / r["source"], folder / r["target"], read_transform(folder / r["transform"])) for r in rows]
+
+
+def load_pairs(path: Path, cloud_points: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Labelled pairs of a CSV file (source, target, transform; paths relative to it): two arrays (S, M, 3), float32.
+
+    The source is moved onto its target; both are centred on the target and scaled as one. Raises FmrError.
+    """
+    rng = np.random.default_rng(seed)
+    sources: list[np.ndarray] = []
+    targets: list[np.ndarray] = []
+    for source_path, target_path, T in read_pairs(path):
+        source, target = (read_cloud(file, attributes=False).points for file in (source_path, target_path))
         both = []
         edge = np.ptp(target, axis=0).max() / (2 * GRID)
         for points in (transform_points(T, source), target):

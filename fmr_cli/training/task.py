@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.training.recipe import LocalRecipe, Recipe
+from fmr_cli.training.recipe import AnyRecipe
 
 Scores = dict[str, dict[str, float]]  # setting -> measure -> value
+Show = Callable[[str, int, int], None]  # what is going on, how much of it is done, of how much
 
 RAMP = 100  # steps over which the learning rate rises from zero: Adam's second moments have settled by then
 LAST_RATE = 0.01  # of the learning rate, where its cosine ends
+
+
+class Files(Protocol):
+    """The folder of a run, as a task sees it."""
+
+    @property
+    def path(self) -> Path: ...
+
+    def write(self, name: str, content: str | bytes) -> None: ...
 
 
 class Task(ABC):
@@ -24,7 +37,7 @@ class Task(ABC):
     measured: what the table of scores shows, in words.
     """
 
-    recipe: Recipe | LocalRecipe
+    recipe: AnyRecipe
     modules: dict[str, nn.Module]
     described: list[str]
     device: torch.device
@@ -32,6 +45,23 @@ class Task(ABC):
     clip: float
     measure: str
     measured: str
+    start_scores: Scores = {}  # noqa: RUF012 (replaced, never changed)
+
+    def renew(self, step: int, steps: int, files: Files, show: Show) -> list[str]:
+        """Gathers what the steps from ``step`` on learn from, where there is more to be had by now; says what."""
+        return []
+
+    def closing_seconds(self, minutes: float) -> float:
+        """Of a run of so many minutes, what ``check`` may take."""
+        return 0.0
+
+    def renewals(self) -> int:
+        """How often ``renew`` will do so again."""
+        return 0
+
+    def check(self, files: Files, seconds: float | None, show: Show) -> dict[str, Any] | None:
+        """A last test of the model that is kept, which may replace it; its figures, or None where there is none."""
+        return None
 
     @abstractmethod
     def losses(self, step: int, steps: int, generator: torch.Generator) -> dict[str, Tensor]:

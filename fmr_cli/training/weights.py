@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.io.weights import Weights, read_weights, weights_bytes
+from fmr_cli.registration.models import bundled_encoder
 
 
 def encoder_bytes(encoder: Encoder, decoder: nn.Module | None = None) -> bytes:
@@ -19,6 +20,11 @@ def encoder_bytes(encoder: Encoder, decoder: nn.Module | None = None) -> bytes:
 
 
 def load_weights(path: Path | str) -> tuple[Encoder, dict[str, Tensor]]:
-    """The encoder and the decoder's tensors, none where the file has none. Raises ModelError: missing, does not fit."""
+    """The encoder and the decoder's tensors, none where the file has none. Raises ModelError: missing, does not fit.
+
+    Of a file that holds no encoder of whole clouds, the bundled one.
+    """
     weights = read_weights(path)
+    if not weights.layers:
+        return bundled_encoder(), {}
     return Encoder.of(weights.layers), {name: torch.from_numpy(array) for name, array in weights.decoder.items()}

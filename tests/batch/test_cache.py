@@ -27,18 +27,19 @@ def test_it_lets_go_of_what_was_used_longest_ago(folder):
 
 def test_it_lets_go_of_what_no_pair_needs_any_more(folder):
     cache, a, b = CloudCache(), folder / "a.ply", folder / "b.ply"
-    cache.expect([a, b, a, a])
     for path in (a, b):
         cache.get(path, seed=0)
-    cache.done_with(a, b)
+    cache.let_go({b})
     assert [key.path for key in cache.files] == [a]
 
 
-def test_another_seed_is_another_entry(folder):
+def test_another_seed_or_a_file_that_was_changed_is_another_entry(folder):
     cache, path = CloudCache(), folder / "a.ply"
     plain = cache.get(path, seed=0)
     assert cache.get(path, seed=0) is plain
     assert cache.get(path, seed=1) is not plain
+    write_cloud(path, PointCloud(np.random.default_rng(1).normal(size=(90, 3))))
+    assert cache.get(path, seed=0).said.count == 90
 
 
 def test_a_file_that_cannot_be_read_says_so_each_time(folder):

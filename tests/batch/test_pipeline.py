@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import pytest
 
-from fmr_cli import Options, read_cloud
-from fmr_cli.batch import align_batch, cache
-from fmr_cli.batch import one_pair as runner
+from fmr_cli import Options, align, read_cloud
+from fmr_cli.batch import align_batch, cache, one_pair, pipeline
+from fmr_cli.batch.manifest import Pair
 from fmr_cli.errors import CloudFileError
+from fmr_cli.registration import export
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 
@@ -67,8 +69,28 @@ def test_cut_off_and_gone_on_with_it_keeps_the_rows_it_has(manifest, tmp_path):
 def test_a_file_of_several_pairs_is_read_once(tmp_path, monkeypatch):
     read = []
     monkeypatch.setattr(cache, "read_cloud", lambda path, **given: read.append(path.name) or read_cloud(path, **given))
-    monkeypatch.setattr(runner, "align", lambda *_: (_ for _ in ()).throw(ValueError("not of interest")))
+    monkeypatch.setattr(one_pair, "align", lambda *_: (_ for _ in ()).throw(ValueError("not of interest")))
     a, b = SAMPLES / "scan_a.ply", SAMPLES / "scan_b.ply"
     (tmp_path / "pairs.csv").write_text("source,target\n" + 8 * f"{a},{b}\n{b},{a}\n")
-    assert len(align_batch(tmp_path / "pairs.csv", tmp_path / "out", workers=4)) == 16
+    assert len(align_batch(tmp_path / "pairs.csv", tmp_path / "out", workers=1)) == 16
     assert sorted(read) == ["scan_a.ply", "scan_b.ply"]
+
+
+def test_pairs_that_share_files_go_to_one_worker_and_spent_files_are_let_go_of(tmp_path):
+    runner = one_pair.PairRunner(tmp_path, tmp_path, Options(), False, False, 0)
+    pairs = [Pair(*ends, "", "") for ends in ("ab", "bc", "cd", "xy", "ya", "ac")]
+    blocks = [*pipeline.in_blocks(runner, pairs, most=2)]
+    assert ["".join(p.source + p.target for p in block.pairs) for block in blocks] == ["abbc", "cd", "xyya", "ac"]
+    assert ["".join(sorted(path.name for path in block.spent)) for block in blocks] == ["b", "d", "xy", "ac"]
+    assert [len(block.pairs) for block in pipeline.in_blocks(runner, pairs, most=4, sharing=False)] == [4, 2]
+
+
+def test_the_metrics_of_each_pair_are_those_of_align(manifest, tmp_path):
+    align_batch(manifest, tmp_path / "out")
+    found = sorted(path.stem for path in (tmp_path / "out" / "metrics").iterdir())
+    assert found == sorted(path.stem for path in (tmp_path / "out" / "transforms").iterdir())
+    assert len(found) == 3
+    metrics = json.loads((tmp_path / "out" / "metrics" / f"{found[0]}.json").read_text())
+    a, b = (read_cloud(SAMPLES / f"scan_{name}.ply") for name in "ab")
+    expected = export.metrics(a, b, align(a, b))
+    assert {**metrics, "seconds": 0} == {**json.loads(json.dumps(expected)), "seconds": 0}

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 
+import layouts
 import pytest
 
-QUICK = ("--pairs", "4", "--points", "128", "--clouds", "1")
+QUICK = ("--pairs", "4", "--points", "128", "--clouds", "1", "--no-align")
 
 
 def test_tables_csv_and_plots(tmp_path, fmr_here, samples):
@@ -56,3 +57,66 @@ def test_bad_input_is_one_line(tmp_path, fmr_here, samples, arguments, said):
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def pairs_csv(tmp_path_factory, samples):
+    """A CSV of the two sample scans, onto each other and the other way round, and a line whose scan is missing."""
+    import numpy as np
+
+    truth = np.loadtxt(samples / "truth.txt")
+    rows = [("scan_a", "scan_b", truth), ("scan_b", "scan_a", np.linalg.inv(truth)), ("none", "scan_b", truth)]
+    path = tmp_path_factory.mktemp("pairs") / "pairs.csv"
+    path.write_text(
+        "source,target,transform\n"
+        + "".join(
+            f"{samples / s}.ply,{samples / t}.ply,{' '.join(map(repr, T[:3].ravel().tolist()))}\n" for s, t, T in rows
+        )
+    )
+    return path
+
+
+def test_the_product_stands_beside_the_solver_alone(tmp_path, fmr_here, samples):
+    one = ("--pairs", "1", "--points", "512", "--clouds", "1", "--experiments", "scenes", "--no-plain")
+    done = fmr_here("evaluate", samples, *one, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "evaluation/results.csv").open() as file:
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"fmr align", "bundled"}
+    assert rows["fmr align"]["success"] == "1.0"
+
+
+def test_a_data_set_is_told_by_its_files(tmp_path, fmr_here, pairs_csv):
+    done = fmr_here("evaluate", pairs_csv, "--no-plain", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "pairs: 3 pairs; right: 5 deg, 2% of the source's diagonal" in done.stdout
+    assert "2 of 6 rows failed and count as wrong; the first: fmr align" in done.stderr
+    with (tmp_path / "out/results.csv").open() as file:
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"fmr align", "solver alone"}
+    ours = rows["fmr align"]
+    assert (ours["recall"], ours["precision_of_aligned"], ours["failed"]) == ("66.67", "100", "1")
+    assert float(ours["rre_deg"]) < 0.5
+    with (tmp_path / "out/pairs.csv").open() as file:
+        assert [row["right"] for row in csv.DictReader(file) if row["method"] == "fmr align"] == ["1", "1", "0"]
+
+
+def test_what_is_quoted_is_marked(tmp_path, fmr_here):
+    layouts.write_eth(tmp_path / "eth")
+    pytest.importorskip("jinja2")
+    few = ("--pairs", "1", "--no-plain", "--no-align")
+    done = fmr_here("evaluate", "eth", *few, "-o", "out", "--report", "r.html", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "quoted: latex_tables/ETH_results.tex" in (tmp_path / "r.html").read_text("utf-8")
+    with (tmp_path / "out/results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows if row["measured"] == "yes"] == ["solver alone"]
+    quoted = [row for row in rows if row["measured"] == "no"]
+    assert quoted
+    assert all("github.com" in row["source"] and not row["pairs"] for row in quoted)
+
+
+def test_a_data_set_and_experiments_exclude_each_other(tmp_path, fmr_here, pairs_csv):
+    done = fmr_here("evaluate", pairs_csv, "--dataset", "pairs", "--experiments", "noise", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "give one of the two" in done.stderr

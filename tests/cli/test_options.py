@@ -32,7 +32,7 @@ def test_every_option_arrives(fmr_here, monkeypatch):
     class SeenError(Exception):
         pass
 
-    def align(source, target, options):
+    def align(source, target, options, **_):
         raise SeenError(options)
 
     monkeypatch.setattr(pipeline, "align", align)
@@ -40,14 +40,19 @@ def test_every_option_arrives(fmr_here, monkeypatch):
         fmr_here(
             "align", "scan_a.ply", "scan_b.ply", "--init", "search", "--voxel-size", 0.5, "--no-normalize",
             "--points", 99, "--dof", "yaw", "--up", 0, 1, 0, "--scale", "--max-angle", 5, "--max-shift", 6,
-            "--iterations", 7, "--no-robust", "--no-refine", "--model", "m.safetensors", "--device", "cpu", "--seed", 8,
+            "--iterations", 7, "--no-robust", "--no-refine", "--allow-mirror",
+            "--model", "m.safetensors", "--device", "cpu", "--seed", 8,
         )  # fmt: skip
     assert seen.value.args[0] == Options(
         init="search", voxel_size=0.5, normalize=False, points=99, dof="yaw", up=(0, 1, 0), scale=True, max_angle=5,
-        max_shift=6, iterations=7, robust=False, refine=False, model=Path("m.safetensors"), device="cpu", seed=8,
+        max_shift=6, iterations=7, robust=False, refine=False, allow_mirror=True,
+        model=Path("m.safetensors"), device="cpu", seed=8,
     )  # fmt: skip
     changed = [f.name for f in fields(Options) if getattr(seen.value.args[0], f.name) != f.default]
-    assert changed == [f.name for f in fields(Options)], "an option is missing above"
+    with pytest.raises(SeenError) as seen:
+        fmr_here("align", "scan_a.ply", "scan_b.ply", "--unit", "mm:m")  # which does without --scale and a given --init
+    assert seen.value.args[0] == Options(unit="mm:m")
+    assert {*changed, "unit"} == {f.name for f in fields(Options)}, "an option is missing above"
 
 
 @pytest.mark.parametrize(
@@ -57,6 +62,8 @@ def test_every_option_arrives(fmr_here, monkeypatch):
         (("--voxel-size", "nan"), "fmr: --voxel-size nan: is no finite number"),
         (("--points", 9), "fmr: --points 9: is too small, give 10 or more"),
         (("--up", 0, 0, 0), "fmr: --up (0.0, 0.0, 0.0): is no direction; give three finite numbers, not all zero"),
+        (("--unit", "mm"), "fmr: --unit mm: give the source's and the target's, such as mm:m, of m, mm, cm"),
+        (("--unit", "mm:m", "--scale"), "fmr: --unit mm:m: leave it out with --scale"),
         (("--init", "feature"), "fmr: feature: is no start (auto, search, features, centroid, identity) and no "),
         (("--init", "twice.txt"), "fmr: --init: its transform scales by 2; add --scale, or give a rigid motion"),
     ],

@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 import pytest
+from simulation import turn_and_shift
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
 from fmr_cli.cloud import angle_degrees
@@ -189,7 +190,7 @@ def test_a_truth_of_another_length_is_one_line(fmr_here, street, tmp_path):
 def test_deskew_undoes_the_motion_within_the_scans(fmr_here, moving, tmp_path):
     folder, truth = moving
     end_errors = []
-    for options in ([], ["--deskew"]):
+    for options in (["--no-deskew"], []):
         done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", *options)
         assert done.returncode == 0, done.stderr
         error = np.linalg.inv(read_poses(tmp_path / "p.txt")) @ truth
@@ -205,3 +206,27 @@ def test_deskew_of_scans_without_times_is_one_line(fmr_here, street, tmp_path):
     assert done.stderr.count("\n") == 1
     assert "0.bin: has no time per point (fields gps_time, time, timestamp, t, " in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_priors_and_a_known_map(fmr_here, street, tmp_path):
+    """The drive's second half, named by its times, in the map of its first; one first pose is told, roughly."""
+    scans, truth = [read_cloud(street[0] / f"{i}.bin") for i in range(FRAMES)], street[1]
+    first = [scan.transformed(T).points for scan, T in zip(scans[:5], truth, strict=False)]
+    write_cloud(tmp_path / "known.las", PointCloud(np.concatenate(first)))
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for i in (4, 5, 6):
+        write_cloud(folder / f"{100 + i / 20:.2f}.ply", scans[i])
+    rough = " ".join(f"{x:.12g}" for x in (truth[4] @ turn_and_shift(2.0, 0.4))[:3].ravel())
+    (tmp_path / "told.csv").write_text(f"scan,pose,sigma_shift\n100.20,{rough},0.5\n")
+    done = fmr_here(
+        "sequence", folder, "--out", tmp_path / "p.tum", "--map", tmp_path / "known.las",
+        "--init-poses", tmp_path / "told.csv", "--format", "tum",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = np.loadtxt(tmp_path / "p.tum")
+    assert np.allclose(rows[:, 0], [100.2, 100.25, 100.3])
+    assert np.abs(rows[:, 1:4] - truth[4:7, :3, 3]).max() < 0.05
+    done = fmr_here("sequence", folder, "--out", tmp_path / "q.txt", "--map", tmp_path / "known.las", "--loop-closure")
+    assert done.returncode == 2
+    assert "poses in a known map don't drift" in done.stderr

@@ -43,12 +43,75 @@ def test_train_on_scans_from_the_bundled_weights(tmp_path, fmr_here, samples):
     }  # fmt: skip
     card = (run / "README.md").read_text()
     assert "16 crops of 2 scans" in card
+    assert 'a recipe of kind "global" teaches the encoder of whole clouds alone' in done.stderr
     assert "started from base" in card
     assert "holds the start" in done.stderr or "which is kept" in done.stderr
     aligned = fmr_here(
         "align", samples / "scan_a.ply", samples / "scan_b.ply", "--model", "runs/train/model.safetensors", cwd=tmp_path
     )
     assert aligned.returncode == 0, aligned.stderr
+
+
+SCANS = """
+kind = "scans"
+rounds = 1
+pairs = 4
+single = 2
+made_up = 4
+patches = 24
+others = 8
+batch = 1
+whole_every = 2
+steps = 4
+epoch_steps = 4
+tested = 2
+checked = 3
+[whole]
+crops = 16
+held_out_pairs = 2
+"""
+
+
+def test_scans_teach_all_that_registration_uses(tmp_path, fmr_here, samples):
+    (tmp_path / "scans.toml").write_text(SCANS)
+    (tmp_path / "scans").mkdir()
+    for name in ("scan_a.ply", "scan_b.ply"):
+        (tmp_path / "scans" / name).write_bytes((samples / name).read_bytes())
+    (tmp_path / "scans/notes.txt").write_text("no scan")  # as folders have them
+    done = fmr_here("train", "--unsupervised", "scans", "--recipe", "scans.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "round 1: 2 scans: 1 of 1 registered pairs aligned" in done.stderr
+    assert "held-out pairs through align" in done.stderr
+    run = tmp_path / "runs/train"
+    assert {"model.safetensors", "training.png", "registered.json"} <= {f.name for f in run.iterdir()}
+    card = (run / "README.md").read_text()
+    assert "Held-out pairs through `fmr align`" in card
+    assert "loss_info_nce" in (run / "metrics.csv").read_text()
+    assert "loss_chamfer" in (run / "metrics.csv").read_text()
+    names = load_file(run / "model.safetensors")
+    assert {name.split(".")[0] for name in names} >= {"encoder", "local"}
+    for command in (
+        ("align", "scans/scan_a.ply", "scans/scan_b.ply"),
+        ("multiway", "scans/scan_a.ply", "scans/scan_b.ply", "--out", "net"),
+    ):
+        used = fmr_here(*command, "--model", "runs/train/model.safetensors", cwd=tmp_path)
+        assert used.returncode == 0, used.stderr
+    again = fmr_here("train", "--unsupervised", "scans", "--recipe", "runs/train/recipe.toml", "-o", "b", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    a, b = (load_file(tmp_path / run / "state.safetensors") for run in ("runs/train", "b"))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_labelled_pairs_teach_the_local_encoder_too(tmp_path, fmr_here, samples):
+    (tmp_path / "scans.toml").write_text(
+        SCANS.replace("checked = 3", "checked = 0").replace("made_up = 4", "made_up = 0")
+    )
+    (tmp_path / "pairs.csv").write_text(
+        f"source,target,transform\n{samples / 'scan_a.ply'},{samples / 'scan_b.ply'},{samples / 'truth.txt'}\n"
+    )
+    done = fmr_here("train", "--recipe", "scans.toml", "--pairs", "pairs.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "1 pairs of known pose" in done.stderr
 
 
 def test_labelled_pairs_are_trained_on(tmp_path, fmr_here, samples, recipe):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmr_cli.evaluation.experiments import EXPERIMENTS, Clouds, feature_maps, run
+from fmr_cli.evaluation.experiments import EXPERIMENTS, Clouds, at_level, feature_maps
 from fmr_cli.evaluation.heldout import Setting, draw, errors
 from fmr_cli.evaluation.methods import baselines, ours
 from fmr_cli.geometry import se3
@@ -63,7 +63,8 @@ def test_the_bundled_encoder_registers_shapes_of_kinds_it_never_saw(clouds, robu
 
 def test_every_method_sees_the_same_pairs(clouds):
     method = ours(bundled_encoder(), 3, True)
-    rows = list(run(EXPERIMENTS["density"], clouds, {"a": method, "b": method}, pairs=4, points=128, seed=0))
+    experiment, methods = EXPERIMENTS["density"], {"a": method, "b": method}
+    rows = [row for number in range(4) for row in at_level(experiment, number, clouds, methods, 4, 128, seed=0)]
     assert [(r.level, r.method) for r in rows] == [(level, m) for level in (1.0, 0.5, 0.25, 0.1) for m in "ab"]
     assert all(a.rotation_mean == b.rotation_mean for a, b in zip(rows[::2], rows[1::2], strict=True))
 

@@ -85,7 +85,7 @@ def test_a_bin_whose_values_do_not_tell_is_refused_with_the_choice(tmp_path: Pat
     cloud = read_cloud(tmp_path / "a.bin", bin_columns=("y", "x", "z", "ring"))
     assert cloud.points.shape == (2100, 3)
     assert cloud.points[0, 0] == np.fromfile(tmp_path / "a.bin", "<f4")[1]
-    with pytest.raises(CloudFileError, match="no multiple of 11 float32"):
+    with pytest.raises(CloudFileError, match=r"no multiple of the 44 that a point takes \(x y z a b"):
         read_cloud(tmp_path / "a.bin", bin_columns=tuple("xyzabcdefgh"))
 
 
@@ -98,16 +98,20 @@ def test_ncl_t_and_numbers_that_are_no_float32(tmp_path: Path) -> None:
     cloud = read_cloud(tmp_path / "a.bin")
     assert np.abs(cloud.points - xyz).max() < 1e-9
     assert "NCLT" in cloud.layout
-    (xyz * 1.23456).astype("<f8").tofile(tmp_path / "b.bin")
+    (tmp_path / "b.bin").write_bytes(rng.bytes(16_000))
     with pytest.raises(CloudFileError, match="holds no float32 coordinates"):
         read_cloud(tmp_path / "b.bin")
+    (tmp_path / "c.bin").write_text("1.0 2.0 3.0\n" * 4)
+    with pytest.raises(CloudFileError, match="is text: give it the suffix"):
+        read_cloud(tmp_path / "c.bin")
 
 
 @pytest.mark.parametrize(
     ("array", "what"),
     [
         (np.ones((480, 640)), "is it a depth image"),
-        (np.ones((3, 20)), "3 points, or 20?"),
+        (np.ones((48, 17)), "is it a depth image"),
+        (np.eye(4), "holds a 4x4 transform and no points"),
         (np.ones((7, 2)), "points need (N, 3)"),
         (np.ones((2, 2, 2)), "points need (N, 3)"),
         (np.array(["a", "b"]), "points need numbers"),

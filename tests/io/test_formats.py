@@ -9,8 +9,9 @@ from pathlib import Path
 import lzf
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from fmr_cli.cloud import PointCloud
+from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.io import WRITABLE, read_cloud, write_cloud
 
 # E57 needs pye57, which is an extra
@@ -109,17 +110,45 @@ def test_only_the_coordinates_are_read_on_request(tmp_path: Path, cloud: PointCl
     assert np.array_equal(bare.points, read_cloud(tmp_path / f"a{suffix}").points)
 
 
+NORMALS, COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
+HOLD_CRS = (".ply", ".pcd", ".las", ".laz", ".npz", ".e57")
+
+
+def kept(suffix: str, names: list[str]) -> list[str]:
+    """Which of a cloud's attributes a format holds, as docs/formats.md says."""
+    if suffix == ".bin":
+        return [name for name in names if name == "intensity"]
+    if suffix in (".pts", ".ptx"):
+        return [name for name in names if name in ("intensity", *COLORS)]
+    if suffix == ".npy":
+        return names if names in (["intensity"], ["intensity", *COLORS]) else []
+    return names
+
+
 @pytest.mark.parametrize("source", HERE)
 @pytest.mark.parametrize("target", HERE)
 def test_any_format_to_any_format(tmp_path: Path, cloud: PointCloud, source: str, target: str) -> None:
+    """Coordinates, attributes, vectors under a turn, and the coordinate system, from each format to each."""
     write_cloud(tmp_path / f"a{source}", cloud)
-    first = read_cloud(tmp_path / f"a{source}")
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.4]).as_matrix()
+    T[:3, 3] = FAR - T[:3, :3] @ FAR + [3, 4, 5]
+    first = read_cloud(tmp_path / f"a{source}").transformed(T)
     write_cloud(tmp_path / f"b{target}", first)
     second = read_cloud(tmp_path / f"b{target}")
-    tolerance = {".bin": 0.26, ".las": 5.1e-7, ".laz": 5.1e-7}.get(target, 0)  # float32 in UTM; half a scale step
-    assert np.abs(first.points - second.points).max() <= tolerance
-    if ".npy" not in (source, target):  # intensity is what all others hold
-        assert np.array_equal(second.attributes["intensity"], cloud.attributes["intensity"])
+    tolerance = {".bin": 0.26, ".las": 5.1e-7, ".laz": 5.1e-7}  # float32 in UTM; half a scale step
+    assert np.abs(first.points - second.points).max() <= tolerance.get(target, 2e-9)  # of PTX, in its scan's frame
+    moved = transform_points(T, cloud.points)
+    assert np.abs(second.points - moved).max() <= tolerance.get(source, 0) + tolerance.get(target, 0) + 2e-9
+    expected = cloud.transformed(T).attributes
+    for name in kept(target, kept(source, list(cloud.attributes))):
+        close = 1e-6 if name in NORMALS else 0
+        values = second.attributes[name]
+        if name in COLORS and values.max() > 255:  # LAS: 8 bits as 16
+            values = values / 257
+        np.testing.assert_allclose(values, expected[name], rtol=0, atol=close, err_msg=name)
+    both = source in HOLD_CRS and target in HOLD_CRS
+    assert second.crs == (cloud.crs if both else None)
 
 
 PLY_ROWS = [(1.5, -2.0, 3.25, 7, 200), (4.0, 5.0, 6.0, -8, 0), (0.0, 0.5, 1.0, 9, 255)]

@@ -28,18 +28,33 @@ def finish(trainer: Trainer) -> list[dict]:
     return [report.row for report in trainer.run() if report.row]
 
 
+def views_at(place: torch.Tensor, alias: torch.Tensor | None = None) -> Views:
+    n = len(place)
+    no = torch.zeros(n, n, dtype=torch.bool) if alias is None else alias
+    return Views(torch.empty(n, 1, 1), torch.empty(n, 1, 1), place, place, n, no, no)
+
+
 def test_info_nce_is_zero_where_each_row_fits_its_own_alone():
-    place = torch.arange(4.0)[:, None] * 10 * torch.ones(3)
-    assert float(info_nce(torch.eye(4), torch.eye(4), place, 0.01, 3)) == pytest.approx(0, abs=1e-6)
+    views = views_at(torch.arange(4.0)[:, None] * 10 * torch.ones(3))
+    assert float(info_nce(torch.eye(4), torch.eye(4), views, 0.01, 3)) == pytest.approx(0, abs=1e-6)
     mixed = torch.eye(4)[[1, 0, 3, 2]]
-    assert float(info_nce(torch.eye(4), mixed, place, 0.1, 3)) > 5
+    assert float(info_nce(torch.eye(4), mixed, views, 0.1, 3)) > 5
 
 
-def test_near_places_do_not_repel():
-    place = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+def test_near_places_and_aliases_do_not_repel():
+    views = views_at(torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
     same = torch.ones(2, 1)
-    assert float(info_nce(same, same, place, 0.1, apart=3)) == pytest.approx(0, abs=1e-6)
-    assert float(info_nce(same, same, place, 0.1, apart=0.5)) == pytest.approx(np.log(2))
+    assert float(info_nce(same, same, views, 0.1, apart=3)) == pytest.approx(0, abs=1e-6)
+    assert float(info_nce(same, same, views, 0.1, apart=0.5)) == pytest.approx(np.log(2))
+    alias = views_at(views.place, ~torch.eye(2, dtype=torch.bool))
+    assert float(info_nce(same, same, alias, 0.1, apart=0.5)) == pytest.approx(0, abs=1e-6)
+
+
+def test_what_is_in_one_scan_alone_repels():
+    views = views_at(torch.tensor([[0.0, 0, 0], [9, 0, 0]]))
+    views.common, views.alias, views.alias_target = 1, views.alias[:1], views.alias_target[:1]
+    same = torch.ones(2, 1)
+    assert float(info_nce(same, same, views, 0.1, apart=3)) == pytest.approx(np.log(2))
 
 
 def test_views_are_the_same_for_any_number_of_workers(material):

@@ -36,7 +36,7 @@ def test_missing_keys_keep_their_defaults(tmp_path):
         ("anchor_steps = 5\nanchor_width = 0", "anchor_width = 0"),
         ("steps =", "not valid TOML"),
         ("augment = 3", "must be a table"),
-        ("kind = 'other'", "kind must be 'global' or 'local'"),
+        ("kind = 'other'", "kind must be 'scans', 'global' or 'local'"),
         ("kind = 'local'\npoints = 3", "unknown key 'points'"),
         ("kind = 'local'\npairs = 2", "2 pairs; a batch of 4 needs more"),
         ("kind = 'local'\ntemperature = 0", "temperature = 0"),

@@ -1,0 +1,144 @@
+"""kill -9 and a full disk while a file is written: what was there before is there after, and nothing else stays."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmr_cli.cloud import PointCloud
+from fmr_cli.io import atomic_write, read_cloud, write_cloud, write_transform
+
+resource = pytest.importorskip("resource")  # POSIX
+OLD = b"what was there before"
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "fmr_cli.cli", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two files of many points, and a transform."""
+    folder = tmp_path_factory.mktemp("scans")
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-20, 20, (2, 300_000))
+    points = np.column_stack([x, y, 3 * np.sin(x) * np.cos(y / 2) + x * y / 40])
+    intensity = {"intensity": rng.integers(0, 999, len(x)).astype(np.uint16)}
+    write_cloud(folder / "a.npz", PointCloud(points, intensity))
+    write_cloud(folder / "b.npz", PointCloud(points[::-1], intensity))
+    T = np.eye(4)
+    T[:3, 3] = [1, 2, 3]
+    write_transform(folder / "T.txt", T)
+    return folder
+
+
+def leftovers(folder: Path) -> list[str]:
+    return [path.name for path in folder.rglob("*") if ".tmp" in path.name]
+
+
+def killed_while_writing(arguments: list[str], folder: Path, delay: float) -> bool:
+    """Starts the command, kills it ``delay`` seconds after its first temporary file has bytes; whether it was alive."""
+    with subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None and not any(p.stat().st_size for p in folder.rglob(".*.tmp*") if p.exists()):
+            time.sleep(0.002)
+        time.sleep(delay)
+        alive = process.poll() is None
+        process.kill()
+    return alive
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".las", ".csv"])
+def test_transform_is_killed(scans: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"out{suffix}"
+    out.write_bytes(OLD)
+    arguments = command("transform", scans / "a.npz", scans / "T.txt", "-o", out)
+    alive = killed_while_writing(arguments, tmp_path, random.Random(suffix).uniform(0, 0.05))
+    if alive:
+        assert out.read_bytes() == OLD
+        assert len(leftovers(tmp_path)) == 1
+    subprocess.run(arguments, check=True)
+    assert leftovers(tmp_path) == []
+    assert read_cloud(out).points.mean(0) == pytest.approx(
+        np.array([1, 2, 3]) + read_cloud(scans / "a.npz").points.mean(0)
+    )
+
+
+def test_merged_is_killed(scans: Path, tmp_path: Path) -> None:
+    out, pose = tmp_path / "out.ply", tmp_path / "T.txt"
+    out.write_bytes(OLD)
+    arguments = command(
+        "align", scans / "a.npz", scans / "b.npz", "-o", pose, "--init", "identity", "--merged", out, "--quiet"
+    )
+    if killed_while_writing(arguments, tmp_path, 0.02):
+        assert out.read_bytes() == OLD
+    assert subprocess.run(arguments, check=False).returncode in (0, 3)
+    assert leftovers(tmp_path) == []
+    assert len(read_cloud(out)) == 600_000
+
+
+def test_a_batch_is_killed_and_goes_on(scans: Path, tmp_path: Path) -> None:
+    manifest, out = tmp_path / "pairs.csv", tmp_path / "out"
+    rows = "".join(f"{scans}/a.npz,{scans}/b.npz,identity,p{k}\n" for k in range(3))
+    manifest.write_text(f"source,target,init,name\n{rows}")
+    arguments = command("batch", manifest, "--out", out, "--aligned", "--workers", 1, "--quiet", "--resume")
+    out.mkdir()
+    killed_while_writing(arguments, out / "aligned", 0.02)
+    assert subprocess.run(arguments, check=False).returncode in (0, 3)
+    assert leftovers(out) == []
+    assert len((out / "results.csv").read_text().splitlines()) == 4
+    assert sorted(p.name for p in (out / "aligned").iterdir()) == ["p0.npz", "p1.npz", "p2.npz"]
+
+
+@pytest.mark.parametrize(
+    "suffix", [".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".csv", ".pts", ".ptx", ".e57"]
+)
+def test_a_full_disk(scans: Path, tmp_path: Path, suffix: str) -> None:
+    """A file of more than 1 MB cannot be written: the same as far as a program can tell."""
+    if suffix == ".e57":
+        pytest.importorskip("pye57")
+    out = tmp_path / f"out{suffix}"
+    out.write_bytes(OLD)
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+
+    done = subprocess.run(
+        command("transform", scans / "a.npz", scans / "T.txt", "-o", out), preexec_fn=limit, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert f"{out}" in done.stderr
+    assert out.read_bytes() == OLD
+    assert leftovers(tmp_path) == []
+
+
+def test_only_what_the_dead_have_left_is_removed(tmp_path: Path) -> None:
+    out = tmp_path / "a.ply"
+    with atomic_write(out) as mine:
+        mine.write_bytes(b"1")
+        name = mine.name
+        with subprocess.Popen(["true"]) as process:
+            process.wait()
+        dead = tmp_path / name.replace(f"-{os.getpid()}-", f"-{process.pid}-")
+        dead.write_bytes(b"2")
+        others = [
+            tmp_path / name.replace(".a.", ".ab."),
+            tmp_path / f".a.{os.getpid()}.tmp.ply",
+            tmp_path / "a.tmp.ply",
+        ]
+        for path in others:
+            path.write_bytes(b"3")
+        with atomic_write(out) as again:
+            assert mine.exists()
+            assert not dead.exists()
+            again.write_bytes(b"4")
+    assert out.read_bytes() == b"1"
+    assert all(path.exists() for path in others)

@@ -1,0 +1,79 @@
+"""Mirrored and left-handed clouds; two units of length."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.errors import CloudFileError, OptionsError, RegistrationError
+from fmr_cli.io import read_transform, write_transform
+from fmr_cli.io.transforms import as_transform
+from fmr_cli.registration import Options, align
+from fmr_cli.registration.mirror import MIRROR
+from fmr_cli.registration.pipeline import mirror_fits
+from fmr_cli.registration.units import factor_of
+from fmr_cli.vectors import turn_vectors
+
+
+@pytest.fixture(scope="module")
+def clouds(room_scans: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, PointCloud]:
+    return room_scans[0], PointCloud(room_scans[1])
+
+
+def test_a_mirrored_scan_is_found_on_request_only(tmp_path: Path, clouds: tuple[np.ndarray, PointCloud]) -> None:
+    points, target = clouds
+    source = PointCloud(points[:, [1, 0, 2]] + [5, 0, 0])  # x and y swapped, as of a left-handed file
+    assert align(source, target).status != "aligned"
+    assert mirror_fits(source, target, Options()) is not None
+    assert mirror_fits(PointCloud(points), target, Options()) is None
+    found = align(source, target, Options(allow_mirror=True))
+    assert (found.status, found.mirrored) == ("aligned", True)
+    assert np.linalg.det(found.T_target_source[:3, :3]) == pytest.approx(-1)
+    assert np.abs(transform_points(found.T_target_source, source.points) - points).max() < 0.05
+    write_transform(tmp_path / "T.txt", found.T_target_source)
+    assert np.array_equal(read_transform(tmp_path / "T.txt", mirror=True), found.T_target_source)
+    with pytest.raises(CloudFileError, match="would shear or mirror"):
+        read_transform(tmp_path / "T.txt")
+
+
+def test_a_mirror_moves_vectors_and_keeps_lengths() -> None:
+    T = np.diag([-2.0, 2, 2, 1])
+    assert as_transform(T, mirror=True) is not None
+    given = {"nx": np.array([0.6]), "ny": np.array([0.8]), "nz": np.array([0.0]), "vx": np.array([1.0]),
+             "vy": np.array([2.0]), "vz": np.array([3.0])}  # fmt: skip
+    moved = turn_vectors(given, T)
+    assert [float(moved[n][0]) for n in ("nx", "ny", "nz")] == pytest.approx([-0.6, 0.8, 0])
+    assert [float(moved[n][0]) for n in ("vx", "vy", "vz")] == pytest.approx([-2, 4, 6])
+
+
+def test_a_mirror_turns_splats_as_ellipsoids() -> None:
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_rotvec([0.3, -0.5, 0.9])
+    axes = np.diag([1.0, 4.0, 9.0])
+    x, y, z, w = R.as_quat()
+    splat = {f"rot_{k}": np.array([v]) for k, v in enumerate((w, x, y, z))}
+    moved = turn_vectors(splat, MIRROR)
+    q = [float(moved[f"rot_{k}"][0]) for k in (1, 2, 3, 0)]
+    Q = Rotation.from_quat(q).as_matrix()
+    expected = MIRROR[:3, :3] @ R.as_matrix() @ axes @ R.as_matrix().T @ MIRROR[:3, :3]
+    np.testing.assert_allclose(Q @ axes @ Q.T, expected, atol=1e-12)
+
+
+def test_units(clouds: tuple[np.ndarray, PointCloud]) -> None:
+    points, target = clouds
+    found = align(PointCloud(points * 1000), target, Options(unit="mm:m"))
+    assert found.status == "aligned"
+    assert found.scale == pytest.approx(0.001)
+    assert np.abs(transform_points(found.T_target_source, points * 1000) - points).max() < 0.05
+    with pytest.raises(
+        RegistrationError, match=r"source were in millimetres and the target in metres: say --unit mm:m"
+    ):
+        align(PointCloud(points * 1000), target)
+    assert factor_of("ft:m") == 0.3048
+    assert factor_of("US-ft : ft") == pytest.approx(1.000002)
+    with pytest.raises(OptionsError, match="such as mm:m"):
+        factor_of("furlong:m")

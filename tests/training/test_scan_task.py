@@ -1,0 +1,268 @@
+"""Learning from scans that are registered with each other: material, held-out tests, a killed run that goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from scipy.spatial.transform import Rotation
+
+from fmr_cli import PointCloud, write_cloud
+from fmr_cli.cloud import angle_degrees, transform_points
+from fmr_cli.errors import ModelError
+from fmr_cli.multiway.links import Hypothesis, Link
+from fmr_cli.multiway.scans import Scan
+from fmr_cli.registration.models import model
+from fmr_cli.synthetic import scenes
+from fmr_cli.training.local_views import PATCH_RADIUS, aliases
+from fmr_cli.training.loop import Trainer
+from fmr_cli.training.recipe import ScanRecipe
+from fmr_cli.training.scan_task import ROUNDS, ScanTask, held_out, local_start, read_rounds
+from fmr_cli.training.scan_views import (
+    Overlapping,
+    drawn_views,
+    inlier_ratio,
+    made_up_pair,
+    seen_twice,
+    visible,
+    whole_views,
+)
+from fmr_cli.training.self_registration import BLOCK, drawn, of_all_bands, parts, register_scans, sure_links
+
+CPU = torch.device("cpu")
+TINY = ScanRecipe(
+    rounds=2, pairs=4, single=2, made_up=0, patches=24, others=8, whole_every=0, steps=4, epoch_steps=2, tested=2,
+    checked=0, batch=1,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def room() -> list[np.ndarray]:
+    """Five scans of a furnished room, each in a frame of its own, and the poses that put them there."""
+    rng = np.random.default_rng(3)
+    scene, found = scenes.room(rng), []
+    for k in range(5):
+        eye = np.array([0.2 * k - 0.4, 0.1 * k, 1.4])
+        found.append(scenes.room_scan(scene, rng, eye, 0.25 * k, views=4)[::3])
+    return found
+
+
+@pytest.fixture(scope="module")
+def files(room, tmp_path_factory) -> tuple[list[Scan], list[np.ndarray]]:
+    folder, poses = tmp_path_factory.mktemp("scans"), []
+    rng = np.random.default_rng(4)
+    scans = []
+    for k, points in enumerate(room):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 3, 3)
+        write_cloud(folder / f"scan_{k}.ply", PointCloud(transform_points(T, points)))
+        poses.append(T)
+        scans.append(Scan(f"scan_{k}", folder / f"scan_{k}.ply"))
+    return scans, poses
+
+
+@pytest.fixture(scope="module")
+def found(files):
+    return register_scans(files[0], list(range(5)), None, 12, 0)
+
+
+def test_scans_register_themselves_and_every_pair_of_a_part_has_a_pose(files, found):
+    poses = files[1]
+    assert len(found.pairs) >= 4
+    for pair in found.pairs:
+        truth = poses[pair.target] @ np.linalg.inv(poses[pair.source])
+        E = np.linalg.inv(truth) @ np.array(pair.T_target_source)
+        assert angle_degrees(E) < 3
+        assert 0.1 <= pair.overlap <= 1
+    assert "pairs show one place" in found.said
+
+
+def test_a_wrong_link_that_is_not_sure_joins_nothing():
+    """Four scans round a cycle; a fifth link, aligned by half, says otherwise and is denied by its triangles."""
+    rng = np.random.default_rng(0)
+    poses = {}
+    for n in range(5):
+        poses[n] = np.eye(4)
+        poses[n][:3, :3], poses[n][:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 2, 3)
+    ends = {(1, 0): 0.95, (2, 1): 0.8, (2, 0): 0.95, (3, 2): 0.99, (3, 0): 0.75, (4, 3): 0.85}
+    links = {}
+    for (i, j), confidence in ends.items():
+        T = np.linalg.inv(poses[j]) @ poses[i]
+        T[:3, 3] += 3.0 * ((i, j) == (3, 0))  # the wrong one
+        links[i, j] = Link(i, j, "aligned", "look", [Hypothesis(T, confidence)], edge=0.05)
+    survey = SimpleNamespace(
+        links=links, edges=dict.fromkeys(range(5), 0.05), description=lambda n, edge: SimpleNamespace(moment=np.eye(4))
+    )
+    sure = sure_links(survey)
+    assert [link.ends for link in sure] == [(3, 2), (1, 0), (2, 0)]
+    [part] = parts(sure)
+    assert sorted(part) == [0, 1, 2, 3]
+    for i in part:
+        T = np.linalg.inv(part[0]) @ part[i]
+        np.testing.assert_allclose(T, np.linalg.inv(poses[0]) @ poses[i], atol=1e-9)
+
+
+def test_scans_that_share_nothing_and_broken_files_are_said(tmp_path, files):
+    rng = np.random.default_rng(0)
+    (tmp_path / "broken.ply").write_text("ply\nnothing")
+    other = scenes.thing_scan(scenes.thing(rng), rng, rng.normal(size=3), 2)
+    write_cloud(tmp_path / "other.ply", PointCloud(other))
+    scans = [files[0][0], Scan("other", tmp_path / "other.ply"), Scan("broken", tmp_path / "broken.ply")]
+    found = register_scans(scans, [0, 1, 2], None, 12, 0)
+    assert found.pairs == []
+    assert "learning from single scans alone" in found.said
+    assert found.scans == [0, 1]
+    assert len(found.skipped) == 1
+    assert "broken.ply" in found.skipped[0]
+
+
+def test_of_ten_thousand_scans_some_rows_are_drawn():
+    rng = np.random.default_rng(0)
+    some = drawn(10_000, 40, rng)
+    assert len(some) == len(set(some)) == 40
+    assert max(some) < 10_000
+    gaps = np.diff(some)
+    assert (gaps <= BLOCK).mean() > 0.8  # most have a neighbour that overlaps
+    assert drawn(7, 40, rng) == list(range(7))
+
+
+def test_all_bands_of_overlap_are_drawn():
+    candidates = [(k, 0, np.eye(4), share) for k, share in enumerate([0.9] * 30 + [0.4] * 3 + [0.15] * 3)]
+    shares = [c[3] for c in of_all_bands(candidates, 9, np.random.default_rng(0))]
+    assert sorted(shares) == [0.15] * 3 + [0.4] * 3 + [0.9] * 3
+
+
+def test_views_show_one_place(room):
+    a, b = room[0], room[1]
+    pair = Overlapping(a, b, np.eye(4), 0.06)  # both in the scene's frame
+    views = drawn_views(pair, np.random.default_rng(0), 48, 16, touch=False)
+    assert views is not None
+    n = views.common
+    assert 16 <= n <= 48
+    off = (views.place[:n] - views.place_target[:n]).norm(dim=1)
+    assert float(off.max()) < 2
+    alone = views.place_target[n:]
+    assert len(alone)
+    nearest = torch.cdist(views.place[:n], alone).amin(0)
+    assert float(nearest.min()) > 1  # what is in one scan alone is no view of the others' places
+
+
+def test_matches_of_a_perfect_encoder_are_right(room):
+    views = whole_views(Overlapping(room[0], room[0], np.eye(4), 0.06), 100)
+    ideal = np.eye(len(views.place))
+    assert inlier_ratio(ideal, ideal, views) == 1.0
+    assert inlier_ratio(ideal, np.roll(ideal, 50, axis=0), views) < 0.1
+
+
+def test_two_parts_of_a_scan_share_what_is_asked_for(room):
+    for share in (0.2, 0.75):
+        parts = seen_twice(room[0], np.random.default_rng(1), share)
+        moved = transform_points(parts.T_target_source, parts.source)
+        from fmr_cli.synthetic.sensors import overlap
+
+        assert max(overlap(moved, parts.target, 1.5 * parts.edge)) == pytest.approx(share, abs=0.3)
+    assert seen_twice(room[0][:300], np.random.default_rng(1)) is None
+
+
+def test_what_hides_behind_is_not_visible():
+    front = np.column_stack([np.random.default_rng(0).uniform(-1, 1, (4000, 2)), np.zeros(4000)])
+    both = np.concatenate([front, front + np.array([0, 0, 0.5])])
+    for seed in range(5):
+        seen = visible(both, np.random.default_rng(seed), 0.05)
+        assert 0.3 * len(both) < len(seen) < 0.95 * len(both)
+
+
+def test_repeated_patches_are_aliases_and_others_are_not():
+    rng = torch.Generator().manual_seed(0)
+    shapes = torch.rand(6, 64, 10, generator=rng) * 2 - 1
+    own = shapes + 0.02 * torch.randn(6, 64, 10, generator=rng)
+    other = shapes.clone()
+    other[5] = other[0] + 0.001 * torch.randn(64, 10, generator=rng)  # a second window, as alike as can be
+    found = aliases(own[:5], other, 5)
+    assert found.shape == (5, 6)
+    assert found[0, 5]
+    assert int(found.sum()) == 1
+    assert PATCH_RADIUS > 0
+
+
+def test_some_scans_are_held_out_and_never_all():
+    assert held_out(1, 0.2, 0) == set()
+    assert len(held_out(2, 0.2, 0)) == 1
+    assert len(held_out(10, 0.2, 0)) == 2
+    assert len(held_out(100, 0.2, 0)) == 20
+    assert held_out(100, 0.2, 0) == held_out(100, 0.2, 0) != held_out(100, 0.2, 1)
+
+
+def trainer(files, folder: Path, resume: bool = False, **changes) -> Trainer:
+    folder.mkdir(exist_ok=True)
+    task = ScanTask(replace(TINY, **changes), files[0], CPU, None, None)
+    return Trainer(task, folder, resume=resume)
+
+
+def finish(trainer: Trainer) -> list[str]:
+    return [note for report in trainer.run() for note in report.notes]
+
+
+def test_a_run_that_is_killed_in_its_second_round_goes_on_to_the_same_weights(tmp_path, files):
+    whole = trainer(files, tmp_path / "whole")
+    notes = finish(whole)
+    assert [n[:8] for n in notes] == ["round 1:", "round 2:"]
+    for report in trainer(files, tmp_path / "killed").run():
+        if report.step == 3:  # the second round has begun, its epoch is not saved
+            break
+    finish(trainer(files, tmp_path / "killed", resume=True))
+    for name in ("state.safetensors", "model.safetensors"):
+        a, b = (load_file(tmp_path / run / name) for run in ("whole", "killed"))
+        assert all(torch.equal(a[key], b[key]) for key in a)
+    assert (tmp_path / "whole" / ROUNDS).read_text() == (tmp_path / "killed" / ROUNDS).read_text()
+
+
+def test_the_file_is_a_whole_model(tmp_path, files):
+    run = trainer(files, tmp_path, rounds=1)
+    finish(run)
+    kept = model(tmp_path / "model.safetensors")
+    assert np.array_equal(kept.whole.layers[0][0], model().whole.layers[0][0])
+    assert kept.local.key == model().local.key or run.progress.best > 0
+    text = "\n".join(run.task.card())
+    assert "Round 1" in text
+    assert not run.task.held_out & {n for p in run.task.rounds[0].pairs if run.task.trains(p) for n in p.ends}
+
+
+def test_one_scan_alone_learns_from_its_parts(tmp_path, files):
+    task = ScanTask(replace(TINY, rounds=1, steps=2), files[0][:1], CPU, None, None)
+    notes = finish(Trainer(task, tmp_path))
+    assert "one scan" in notes[0]
+    assert task.views["single"]
+    assert task.tests["held-out scans"]
+
+
+def test_forgetting_counts_as_no_gain(files):
+    task = ScanTask(TINY, files[0], CPU, None, None)
+    task.start_scores = {"held-out scans": {"right matches": 0.2}, "made-up scans": {"right matches": 0.3}}
+    gained = {"held-out scans": {"right matches": 0.5}, "made-up scans": {"right matches": 0.29}}
+    forgot = {"held-out scans": {"right matches": 0.5}, "made-up scans": {"right matches": 0.2}}
+    assert task.quality(gained) == (0.5,)
+    assert task.quality(forgot) == (0.0,)
+
+
+def test_a_start_that_is_no_local_encoder_and_spoilt_rounds_are_one_line(tmp_path):
+    from safetensors.numpy import save_file
+
+    save_file({"local.point.0.weight": np.zeros((3, 3), np.float32)}, str(tmp_path / "x.safetensors"))
+    with pytest.raises(ModelError, match="do not fit the local encoder"):
+        local_start(tmp_path / "x.safetensors")
+    (tmp_path / ROUNDS).write_text("[{")
+    with pytest.raises(ModelError, match="no rounds to resume") as error:
+        read_rounds(tmp_path / ROUNDS)
+    assert "\n" not in str(error.value)
+
+
+def test_made_up_pairs_are_the_same_each_time():
+    a, b = made_up_pair((1, 2)), made_up_pair((1, 2))
+    assert np.array_equal(a.source, b.source)
+    assert len(a.source) >= 500

@@ -1,0 +1,236 @@
+"""A real scheduler and real workers: the answers in order whatever happens to some workers, or one clear line.
+
+The tests share a cluster as far as they can, since each of its processes takes a second to start.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+distributed = pytest.importorskip("distributed")
+
+from workers import work  # noqa: E402
+from workers.cluster import Cluster, stop, wait_for  # noqa: E402
+
+import fmr_cli  # noqa: E402
+from fmr_cli import read_cloud, write_cloud  # noqa: E402
+from fmr_cli.batch import align_batch  # noqa: E402
+from fmr_cli.cli.app import main  # noqa: E402
+from fmr_cli.errors import FmrError  # noqa: E402
+from fmr_cli.multiway import align_many  # noqa: E402
+from fmr_cli.workers import DaskWorkers, cluster, handing  # noqa: E402
+from fmr_cli.workers.base import LostError  # noqa: E402
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+WRONG_VERSION = "import fmr_cli; fmr_cli.__version__ = '0.0.1'"
+WITHOUT_FMR = "import sys; sys.modules['fmr_cli'] = None"
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A scheduler with two workers that can be used, and one that has another version."""
+    with Cluster(tmp_path_factory.mktemp("dask")) as found:
+        for first in ("", "", WRONG_VERSION):
+            found.worker(first)
+        with distributed.Client(found.address, set_as_default=False) as client:
+            client.wait_for_workers(3, timeout=120)
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    monkeypatch.setattr(handing, "PATIENCE", 2.0)
+    monkeypatch.setattr(handing, "SLOWER", 1.5)
+    monkeypatch.setattr(handing, "TICK", 0.1)
+    monkeypatch.setattr(cluster, "LOOK", 0.2)
+    monkeypatch.setattr(cluster, "CONNECT", 10.0)
+
+
+def have(workers: DaskWorkers, count: int) -> None:
+    """Waits until so many workers can be used."""
+    wait_for(lambda: workers.look_at_workers() and len(workers.fit) == count)
+
+
+def test_answers_in_order_by_workers_of_this_version_only(shared):
+    said = []
+    with DaskWorkers(shared.address, say=said.append) as workers:
+        wait_for(lambda: workers.look_at_workers() and len(workers.fit) == 2 and workers.refused)
+        assert [*workers.run(work.later, range(30))] == [*range(30)]
+        assert len(set(workers.run(work.process_of, range(40)))) == 2
+        with pytest.raises(FmrError, match="three is too much"):
+            [*workers.run(work.complains_of_three, range(9))]
+    (line,) = [line for line in said if "left out" in line]
+    assert "0.0.1" in line
+    assert fmr_cli.__version__ in line
+
+
+def test_what_is_kept_is_let_go_of_at_the_end(shared):
+    with DaskWorkers(shared.address, say=lambda _: None) as workers:
+        have(workers, 2)
+        assert max(workers.run(work.so_far, range(20))) > 5
+        assert max(workers.run(work.so_far, range(2))) > 5
+    with DaskWorkers(shared.address, say=lambda _: None) as workers:
+        assert max(workers.run(work.so_far, range(2))) <= 2
+
+
+def test_closing_gives_up_what_is_under_way(shared):
+    with DaskWorkers(shared.address, say=lambda _: None) as workers:
+        answers = workers.run(work.slow, range(50))
+        next(answers)
+        answers.close()
+        wait_for(lambda: not any(workers.client.processing().values()))
+
+
+def test_a_client_that_is_given_stays_open(shared):
+    with distributed.Client(shared.address, set_as_default=False) as client:
+        with DaskWorkers(client, say=lambda _: None) as workers:
+            assert [*workers.run(work.square, range(3))] == [0, 1, 4]
+        assert client.status == "running"
+
+
+def test_a_file_that_one_worker_does_not_see(shared, tmp_path):
+    """The third worker has an empty folder in the place of ours."""
+    (tmp_path / "scan.ply").write_text("")
+    unshare = ("unshare", "-rm", "sh", "-c", f'mount -t tmpfs none {tmp_path} && exec "$@"', "sh")
+    if not shutil.which("unshare") or subprocess.run([*unshare, "true"], capture_output=True).returncode:
+        pytest.skip("this machine lets no one mount in a namespace of their own")
+    blind = shared.worker(prefix=unshare)
+    path, said = str(tmp_path / "scan.ply"), []
+    try:
+        with DaskWorkers(shared.address, say=said.append) as workers:
+            have(workers, 3)
+            assert len(set(workers.run(work.with_file, 20 * [path]))) == 2
+            assert any(f"{path} is not there" in line and "left out" in line for line in said)
+            with pytest.raises(FmrError, match="none of 4 workers can be used"):
+                [*workers.run(work.with_file, [str(tmp_path / "nowhere")])]
+    finally:
+        blind.kill()
+
+
+def table(out: Path) -> list[dict[str, str]]:
+    with (out / "results.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
+    """Of four workers one is killed and one stopped; the run is cut off, and gone on with by processes.
+
+    All pairs start from the truth, which is quick.
+    """
+    for name in "ab":
+        cloud = read_cloud(SAMPLES / f"scan_{name}.ply")
+        write_cloud(tmp_path / f"{name}.ply", cloud.select(slice(None, None, 8)))
+    manifest = tmp_path / "pairs.csv"
+    shutil.copy(SAMPLES / "truth.txt", tmp_path)
+    manifest.write_text("source,target,init\n" + 5 * "a.ply,b.ply,truth.txt\n" + "a.ply,nowhere.ply,\n"
+                        + 3 * "a.ply,b.ply,truth.txt\n")  # fmt: skip
+    killed, stopped = shared.worker(), shared.worker()
+
+    def harm(row, done, total):
+        if done == 1:
+            killed.kill()
+            stop(stopped)
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with DaskWorkers(shared.address, say=lambda _: None) as workers:
+        have(workers, 4)
+        with pytest.raises(KeyboardInterrupt):
+            align_batch(manifest, tmp_path / "dask", aligned=True, workers=workers, on_row=harm)
+    stopped.kill()
+    align_batch(manifest, tmp_path / "dask", aligned=True, resume=True, workers=2)
+    align_batch(manifest, tmp_path / "here", aligned=True, workers=1)
+    assert [row["status"] for row in table(tmp_path / "here")].count("failed") == 1
+    assert table(tmp_path / "dask") == table(tmp_path / "here")
+    files = {path.relative_to(tmp_path / "here") for path in (tmp_path / "here").rglob("*.*")}
+    assert files == {path.relative_to(tmp_path / "dask") for path in (tmp_path / "dask").rglob("*.*")}
+    for file in files:
+        if file.parent.name in ("transforms", "aligned"):
+            assert (tmp_path / "dask" / file).read_bytes() == (tmp_path / "here" / file).read_bytes()
+
+
+def test_a_network_is_the_same(shared, tmp_path):
+    """Three scans, of which one is a moved copy of the first one's other points."""
+    a, b = (read_cloud(SAMPLES / f"scan_{name}.ply").select(slice(None, None, 10)) for name in "ab")
+    T = np.array([[0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1.0]])
+    c = read_cloud(SAMPLES / "scan_a.ply").select(slice(3, None, 10)).transformed(T)
+    for name, cloud in zip("abc", (a, b, c), strict=True):
+        write_cloud(tmp_path / f"{name}.ply", cloud)
+    scans = [tmp_path / f"{name}.ply" for name in "abc"]
+    with DaskWorkers(shared.address, say=lambda _: None) as workers:
+        have(workers, 2)
+        there = align_many(scans, workers=workers)
+    here = align_many(scans, workers=2)
+    assert len(here.links) == 3
+    assert np.array_equal([s.T_component_scan for s in here.scans], [s.T_component_scan for s in there.scans])
+    assert [link.confidence for link in here.links] == [link.confidence for link in there.links]
+
+
+def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path, monkeypatch, capsys):
+    found = []
+    experiment = ["--no-align", "--experiments", "noise", "--pairs", "2", "--points", "64"]
+    for more in (["--dask", shared.address], []):
+        out = tmp_path / f"evaluation{len(more)}"
+        monkeypatch.setattr(sys, "argv", ["fmr", "evaluate", str(SAMPLES), "-o", str(out), *experiment, *more])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr().err
+        assert end.value.code == 0, said
+        assert ("dashboard: http" in said) == bool(more)
+        with (out / "results.csv").open(newline="") as file:
+            found.append([{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)])
+    assert len(found[0]) == 10
+    assert found[0] == found[1]
+
+
+def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
+    for _ in range(4):
+        shared.worker()
+    with DaskWorkers(shared.address, say=lambda _: None) as workers:
+        have(workers, 6)
+        answers = [*workers.run(work.dies_of_three, range(6))]
+    assert [a for a in answers if not isinstance(a, LostError)] == [0, 1, 2, 4, 5]
+
+
+def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monkeypatch):
+    with Cluster(tmp_path) as alone:
+        monkeypatch.setattr(cluster, "NO_WORKERS", 0.5)
+        with pytest.raises(FmrError, match="it has no workers"), DaskWorkers(alone.address):
+            pass
+        monkeypatch.setattr(cluster, "NO_WORKERS", 120)
+        without = alone.worker(WITHOUT_FMR)
+        with (
+            pytest.raises(FmrError, match=r"none of 1 workers can be used; .* lacks fmr_cli"),
+            DaskWorkers(alone.address, say=lambda _: None),
+        ):
+            pass
+        without.kill()
+        alone.worker()
+        with DaskWorkers(alone.address, say=lambda _: None) as workers:
+            answers = workers.run(work.slow, range(100))
+            assert [next(answers) for _ in range(5)] == [*range(5)]
+            alone.scheduler.kill()
+            begin = time.monotonic()
+            with pytest.raises(FmrError, match="lost the connection"):
+                list(answers)
+            assert time.monotonic() - begin < 10 * cluster.CONNECT
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [("tcp://127.0.0.1:9", "nobody answers"), ("tls://127.0.0.1:9", "certificates"), ("x://y", "give an address"),
+     ("host", "give an address")],
+)  # fmt: skip
+def test_an_address_where_nobody_is(address, said):
+    with pytest.raises(FmrError, match=said) as error:
+        DaskWorkers(address).__enter__()
+    assert os.linesep not in str(error.value)
