@@ -6,6 +6,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import BinaryIO
 
 import numpy as np
@@ -42,6 +43,7 @@ TRIPLES = {
 }
 
 
+@lru_cache(maxsize=1 << 12)
 def plain(name: str) -> str:
     """A field's name without its unit, quotes and signs, in small letters: "X [m]", "x_coord", "Points:0"."""
     name = "".join(c for c in unicodedata.normalize("NFKD", name.lower()) if not unicodedata.combining(c))
@@ -72,12 +74,13 @@ def refuse_degrees(names: Iterable[str]) -> None:
 def unique(names: Iterable[str]) -> list[str]:
     """The names, repeated ones told apart by a number: a, b, a -> a, b, a_2."""
     seen: set[str] = set()
+    last: dict[str, int] = {}  # number given to a name: a damaged header may repeat one 100,000 times
     result = []
     for name in names:
-        number, free = 1, name
+        free = name
         while free in seen:
-            number += 1
-            free = f"{name}_{number}"
+            last[name] = last.get(name, 1) + 1
+            free = f"{name}_{last[name]}"
         seen.add(free)
         result.append(free)
     return result

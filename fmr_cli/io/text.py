@@ -29,6 +29,7 @@ from fmr_cli.io.table import COMMENTS, ROWS, THOUSANDS, Dialect, Lines, Rows, nu
 HEAD = 200  # lines that are looked at to tell how the file is written
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 PTS = ("intensity", *COLORS)  # what a PTS line may hold after x y z, in that order
+MOST_COLUMNS = 10_000
 PREAMBLE = 30  # lines before the names, at most
 SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
@@ -138,6 +139,8 @@ def skip_preamble(head: Rows) -> None:
         raise CloudFileError("is an ESRI grid, a raster of heights and no points: gdal2xyz or QGIS make points of it")
     for i, line in enumerate(head.lines[:PREAMBLE]):
         words = names_in(line)
+        if len(words) > MOST_COLUMNS:
+            raise CloudFileError(f"line {head.numbers[i]}: has {len(words)} columns, it is no table of points")
         if sum(map(is_number, words)) >= 3:
             return
         if coordinates(words):

@@ -17,7 +17,7 @@ from fmr_cli.geometry.observability import WEAK
 from fmr_cli.geometry.point_to_plane import point_to_plane
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.multiway.pose_graph import EXACT, Prior, adjoint
-from fmr_cli.multiway.workers import Workers
+from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 
 FINER = 2.0  # times the grid on which pairs are registered
@@ -90,7 +90,7 @@ def refine(
     pairs: list[tuple[int, int]],
     held: set[int],
     motion: Motion,
-    workers: Workers,
+    workers: Threads,
     priors: Iterable[Prior] = (),
 ) -> Refined:
     """The poses at which all pairs fit best at once. held: scans that don't move; priors: poses known beforehand."""

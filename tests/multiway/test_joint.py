@@ -9,12 +9,12 @@ from fmr_cli import PointCloud
 from fmr_cli.geometry.frames import enter_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.multiway import joint
-from fmr_cli.multiway.workers import Workers
+from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import prepare
 
 
 def test_the_normalised_estimation_error_squared_is_about_its_dimension():
-    squares, workers = [], Workers(1)
+    squares, workers = [], Threads(1)
     for seed in range(50, 54):
         clouds, truth = room_views(seed, 5)
         ready = [prepare(PointCloud(points)) for points in clouds]

@@ -127,25 +127,3 @@ def test_options_of_a_run_name_its_attempts():
     T[0, 3] = 0.1
     keys = {key_of(1, 0, "pose", Options(init=x)) for x in (np.eye(4), T)} | {key_of(1, 0, "auto", Options())}
     assert len(keys) == 3
-
-
-def test_a_pair_goes_to_another_process_as_a_task_and_gives_the_same(folder):
-    import pickle
-    from functools import partial
-
-    from fmr_cli.multiway.registering import Attempt, register
-
-    kept = store.Store(list_scans([folder / "day1"]), 0, None)
-    for n in range(2):
-        kept.edges[n] = kept.prepared(n).edge
-    task = Attempt(1, 0, "pose", Options(init=np.eye(4)))
-    here = register(kept, task)
-    function, sent = pickle.loads(pickle.dumps((partial(register, kept), task)))
-    there = function(sent)
-    assert sent.key == task.key
-    assert (there.status, there.message) == (here.status, here.message)
-    assert [h.confidence for h in there.hypotheses] == [h.confidence for h in here.hypotheses]
-    assert all(
-        np.array_equal(a.T_target_source, b.T_target_source)
-        for a, b in zip(here.hypotheses, there.hypotheses, strict=True)
-    )

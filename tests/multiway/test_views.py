@@ -1,0 +1,67 @@
+"""What a scan sees through, from where it was taken, and the main directions of what people build."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rooms import room_views
+from scipy.spatial.transform import Rotation
+
+from fmr_cli import PointCloud
+from fmr_cli.geometry.frames import enter_frames
+from fmr_cli.geometry.motion import Motion
+from fmr_cli.multiway import visibility
+from fmr_cli.multiway.directions import main_directions, turned
+from fmr_cli.registration import prepare
+
+
+@pytest.fixture(scope="module")
+def pair():
+    clouds, truth = room_views(7, 2, points=60_000, columns=360)
+    ready = [prepare(PointCloud(points)) for points in clouds]
+    return ready, truth, [visibility.view(scan, ready[0].edge) for scan in ready]
+
+
+def test_the_viewpoint_is_found_from_the_scan_alone(pair):
+    ready, truth, views = pair
+    for k in range(2):
+        eye = np.array([0.7 * np.cos(k), 0.7 * np.sin(k), 1.4 + 0.05 * k, 1.0])
+        there = ready[k].frame.enter((np.linalg.inv(truth[k]) @ eye)[None, :3])[0]
+        assert np.linalg.norm(views[k].viewpoint - there) < 0.6
+
+
+def test_a_scan_sees_through_another_one_only_at_a_wrong_pose(pair):
+    ready, truth, views = pair
+    T = enter_frames(np.linalg.inv(truth[1]) @ truth[0], ready[0].frame, ready[1].frame)
+    through, said = visibility.contradiction(*views, T)
+    assert said > 1000
+    assert through / said < visibility.CONTRADICTED
+    wrong = T.copy()
+    wrong[:3, 3] += truth[1][:3, :3].T @ [0.8, 0.0, 0.0]
+    through, said = visibility.contradiction(*views, wrong)
+    assert through / said > 2 * visibility.CONTRADICTED
+
+
+def test_the_main_directions_of_a_room_are_its_walls_and_a_ball_has_none(pair):
+    ready, truth, _ = pair
+    found = main_directions(ready[0].surface(ready[0].edge).normals)
+    assert found is not None
+    walls = np.abs(truth[0][:3, :3] @ found)  # of a room whose walls lie along x, y and z
+    assert np.allclose(np.sort(walls.max(0)), 1, atol=2e-3)
+    ball = np.random.default_rng(0).normal(size=(5000, 3))
+    assert main_directions(ball / np.linalg.norm(ball, axis=1, keepdims=True)) is None
+
+
+def test_few_right_matches_among_many_wrong_ones_tell_the_shift_once_directions_do_the_rotation():
+    rng = np.random.default_rng(3)
+    source, R, t = rng.uniform(-20, 20, (300, 3)), Rotation.random(random_state=1).as_matrix(), np.array([5.0, -7, 3])
+    target = rng.uniform(-20, 20, (300, 3))
+    target[:20] = source[:20] @ R.T + t + rng.normal(0, 0.3, (20, 3))
+    similarity = rng.uniform(0, 1, (300, 300))
+    similarity[range(20), range(20)] = 2.0
+    poses = turned(source, target, similarity, (np.eye(3), R), Motion())
+    off = [np.linalg.norm(T[:3, 3] - t) + np.linalg.norm(T[:3, :3] - R) for T in poses]
+    assert min(off) < 0.5
+    level = turned(source, target, similarity, (np.eye(3), R), Motion("translation"))
+    assert len(level) == 0, "a rotation that is not allowed is not proposed"
+    assert len(turned(source, target, similarity, (None, R), Motion())) == 0
