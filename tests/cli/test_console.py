@@ -16,10 +16,10 @@ def logged(monkeypatch, fmr_here):
 
     align, log = pipeline.align, logging.getLogger("fmr_cli.registration.anywhere")
 
-    def logging_align(*given):
+    def logging_align(*given, **more):
         log.info("settled by [features]")
         log.debug("a detail")
-        return align(*given)
+        return align(*given, **more)
 
     monkeypatch.setattr(pipeline, "align", logging_align)
     yield lambda *more: fmr_here("align", "scan_a.ply", "scan_b.ply", *more).stderr.splitlines()

@@ -60,14 +60,14 @@ def test_transform_is_killed(scans: Path, tmp_path: Path, suffix: str) -> None:
     out.write_bytes(OLD)
     arguments = command("transform", scans / "a.npz", scans / "T.txt", "-o", out)
     alive = killed_while_writing(arguments, tmp_path, random.Random(suffix).uniform(0, 0.05))
-    if alive:
+    moved = np.array([1, 2, 3]) + read_cloud(scans / "a.npz").points.mean(0)
+    if alive and leftovers(tmp_path):
         assert out.read_bytes() == OLD
-        assert len(leftovers(tmp_path)) == 1
+    elif alive:  # killed after the whole file had taken its name, before the process ended
+        assert read_cloud(out).points.mean(0) == pytest.approx(moved)
     subprocess.run(arguments, check=True)
     assert leftovers(tmp_path) == []
-    assert read_cloud(out).points.mean(0) == pytest.approx(
-        np.array([1, 2, 3]) + read_cloud(scans / "a.npz").points.mean(0)
-    )
+    assert read_cloud(out).points.mean(0) == pytest.approx(moved)
 
 
 def test_merged_is_killed(scans: Path, tmp_path: Path) -> None:
