@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from fmr_cli.geometry.motion import Motion
 EXACT = 1e-9  # sigma, edges and radians, of what is told not to move
 ROBUST = 3.0  # sigmas from which Cauchy's kernel lets a link lose weight
 NARROW, WIDE = 0.02, 10.0  # edges: no link is surer than the first; directions left open get the second
+LOOSE = (
+    1e3  # edges: how surely a scan stays where it began if all its links lose their weight; else it would be nowhere
+)
 LEVEL = 1e-4  # rad, and edges: how far what ``dof`` forbids may move
 
 
@@ -94,6 +98,8 @@ def optimise(
         values.insert(i, gtsam.Pose3(pose))
     for i in sorted(held):
         graph.add(prior_factor(i, T_component_scan[i], np.eye(6) / EXACT**2))
+    for i in sorted(set(T_component_scan) - held):
+        graph.add(prior_factor(i, T_component_scan[i], np.diag([1.0] * 3 + [1 / (LOOSE * edge) ** 2] * 3)))
     for prior in priors:
         sigma = np.array([prior.sigma_rot] * 3 + [prior.sigma_shift] * 3)
         graph.add(prior_factor(prior.scan, prior.T_component_scan, np.diag(1 / np.maximum(sigma, EXACT) ** 2)))
@@ -111,10 +117,39 @@ def optimise(
         measured = gtsam.Pose3(factor.T_target_source)
         graph.add(gtsam.BetweenFactorPose3(factor.target, factor.source, measured, noise))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    marginals = gtsam.Marginals(graph, found)
+    try:
+        marginals = gtsam.Marginals(graph, found)
+    except RuntimeError:  # its Cholesky gives up where some links weigh next to nothing beside others
+        marginals = DenseMarginals(graph, found)
     poses = {i: found.atPose3(i).matrix() for i in sorted(T_component_scan)}
     covariance = {i: marginals.marginalCovariance(i) for i in poses}
     return Solution(poses, covariance, [without(f, poses, marginals, robust) for f in factors])
+
+
+class DenseMarginals:
+    """What ``gtsam.Marginals`` gives, by one dense inverse that copes with entries of very unlike size."""
+
+    def __init__(self, graph: Any, values: Any) -> None:
+        import gtsam
+
+        keys = sorted(values.keys())
+        ordering = gtsam.Ordering()
+        for key in keys:
+            ordering.push_back(key)
+        H = graph.linearize(values).hessian(ordering)[0]
+        scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        self.place = {key: slice(6 * n, 6 * n + 6) for n, key in enumerate(keys)}
+        self.covariance = np.linalg.pinv(H * np.outer(scale, scale), rcond=1e-14, hermitian=True)
+        self.covariance *= np.outer(scale, scale)
+
+    def marginalCovariance(self, i: int) -> np.ndarray:  # noqa: N802 as GTSAM has it
+        return self.at(i, i)
+
+    def jointMarginalCovariance(self, keys: object) -> DenseMarginals:  # noqa: N802
+        return self
+
+    def at(self, i: int, j: int) -> np.ndarray:
+        return np.asarray(self.covariance[self.place[i], self.place[j]])
 
 
 def without(factor: Factor, poses: dict[int, np.ndarray], marginals: object, robust: bool) -> np.ndarray | None:
