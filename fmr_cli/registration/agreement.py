@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.geometry.point_to_plane import point_to_plane
+from fmr_cli.geometry.point_to_plane import FACING, point_to_plane
 from fmr_cli.geometry.surface import Surface
 
 REACH = 4.0  # voxel edges: further off, a point is no business of a surface: a table does not contradict the floor
 TOUCHING = 1.5  # voxel edges: nearer points overlap, as voxels of one surface do
 OVER = 1.0  # voxel edges along the tangent plane, within which a point lies over a surface point
 CLEAR, UNEVEN = 0.5, 2.5  # voxel edges, and times the surface's own unevenness: an offset beyond both contradicts
-ALONG, ACROSS = 0.7, 0.4  # |cosine| between normals: from one on they agree, below the other they contradict
+ACROSS = 0.4  # |cosine| between normals: from FACING on they agree, below this they contradict
 STRETCH_POINTS = 1500  # of the source, on which a change of scale is tried
 STRETCH_REACH = 2.5  # voxel edges
 STRETCH_SIGMAS = 3.0  # deviations that chance may explain
@@ -65,9 +65,9 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
         own_off, own_turn = b.unevenness[0][there] / b.edge, b.unevenness[1][there]
         over = d * d - off * off < OVER**2
         clear = off > np.maximum(CLEAR, UNEVEN * np.maximum(own_off, a.unevenness[0][here] / a.edge))
-        explained = over & ~clear & (cosine > ALONG)
+        explained = over & ~clear & (cosine > FACING)
         touching = d < TOUCHING
-        contradicted = over & (clear | (touching & (cosine < ACROSS) & (own_turn < 1 - ALONG)))
+        contradicted = over & (clear | (touching & (cosine < ACROSS) & (own_turn < 1 - FACING)))
         sums += [
             explained.sum(), contradicted.sum(), touching.sum(), (d[touching] ** 2).sum(), (off[touching] ** 2).sum(),
             (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
