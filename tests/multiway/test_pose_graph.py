@@ -95,3 +95,19 @@ def test_no_link_is_surer_than_its_grid_and_none_is_without_any():
     assert np.sqrt(1 / wide[3, 3]) == pytest.approx(1.0)
     assert np.sqrt(1 / narrow[3, 3]) == pytest.approx(0.002)
     assert np.sqrt(1 / narrow[0, 0]) == pytest.approx(0.001)
+
+
+def test_dense_marginals_are_those_of_gtsam():
+    gtsam = pytest.importorskip("gtsam")
+    T = np.eye(4)
+    T[:3, 3] = [1, 2, 3]
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(pose_graph.prior_factor(0, np.eye(4), 1e6 * np.eye(6)))
+    noise = gtsam.noiseModel.Gaussian.Information(np.diag([1.0, 2, 3, 4, 5, 6]))
+    graph.add(gtsam.BetweenFactorPose3(0, 5, gtsam.Pose3(T), noise))
+    values.insert(0, gtsam.Pose3(np.eye(4)))
+    values.insert(5, gtsam.Pose3(T))
+    dense, theirs = pose_graph.DenseMarginals(graph, values), gtsam.Marginals(graph, values)
+    assert dense.marginalCovariance(5) == pytest.approx(theirs.marginalCovariance(5), abs=1e-12)
+    joint = theirs.jointMarginalCovariance(gtsam.KeyVector([0, 5]))
+    assert dense.at(0, 5) == pytest.approx(joint.at(0, 5), abs=1e-12)
