@@ -98,8 +98,6 @@ def optimise(
         values.insert(i, gtsam.Pose3(pose))
     for i in sorted(held):
         graph.add(prior_factor(i, T_component_scan[i], np.eye(6) / EXACT**2))
-    for i in sorted(set(T_component_scan) - held):
-        graph.add(prior_factor(i, T_component_scan[i], np.diag([1.0] * 3 + [1 / (LOOSE * edge) ** 2] * 3)))
     for prior in priors:
         sigma = np.array([prior.sigma_rot] * 3 + [prior.sigma_shift] * 3)
         graph.add(prior_factor(prior.scan, prior.T_component_scan, np.diag(1 / np.maximum(sigma, EXACT) ** 2)))

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fmr_cli.geometry.motion import Motion, exp
-from fmr_cli.multiway.pose_graph import Factor, Prior, adjoint, bounded, optimise
+from fmr_cli.multiway.pose_graph import DenseMarginals, Factor, Prior, adjoint, bounded, optimise, prior_factor
 
 SIGMA = np.array([1e-3] * 3 + [1e-2] * 3)
 
@@ -102,12 +102,12 @@ def test_dense_marginals_are_those_of_gtsam():
     T = np.eye(4)
     T[:3, 3] = [1, 2, 3]
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(pose_graph.prior_factor(0, np.eye(4), 1e6 * np.eye(6)))
+    graph.add(prior_factor(0, np.eye(4), 1e6 * np.eye(6)))
     noise = gtsam.noiseModel.Gaussian.Information(np.diag([1.0, 2, 3, 4, 5, 6]))
     graph.add(gtsam.BetweenFactorPose3(0, 5, gtsam.Pose3(T), noise))
     values.insert(0, gtsam.Pose3(np.eye(4)))
     values.insert(5, gtsam.Pose3(T))
-    dense, theirs = pose_graph.DenseMarginals(graph, values), gtsam.Marginals(graph, values)
+    dense, theirs = DenseMarginals(graph, values), gtsam.Marginals(graph, values)
     assert dense.marginalCovariance(5) == pytest.approx(theirs.marginalCovariance(5), abs=1e-12)
     joint = theirs.jointMarginalCovariance(gtsam.KeyVector([0, 5]))
     assert dense.at(0, 5) == pytest.approx(joint.at(0, 5), abs=1e-12)
