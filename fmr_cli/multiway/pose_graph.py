@@ -19,9 +19,6 @@ from fmr_cli.geometry.motion import Motion
 EXACT = 1e-9  # sigma, edges and radians, of what is told not to move
 ROBUST = 3.0  # sigmas from which Cauchy's kernel lets a link lose weight
 NARROW, WIDE = 0.02, 10.0  # edges: no link is surer than the first; directions left open get the second
-LOOSE = (
-    1e3  # edges: how surely a scan stays where it began if all its links lose their weight; else it would be nowhere
-)
 LEVEL = 1e-4  # rad, and edges: how far what ``dof`` forbids may move
 
 
