@@ -85,9 +85,9 @@ def check_picture(path: Path | None) -> None:
 def check_screen(wanted: bool) -> None:
     """Before a long computation: --view has a screen. Raises FmrError."""
     if wanted:
-        from fmr_cli.report import view
+        from fmr_cli.report import view_window
 
-        view.check_screen()
+        view_window.check_screen()
 
 
 def columns(given: str | None) -> tuple[str, ...] | None:

@@ -106,7 +106,7 @@ def aligned(options: Options, threads: int) -> Method:
     """The product: `fmr align`, from nothing but the two clouds."""
 
     def run(source: np.ndarray, target: np.ndarray) -> Estimate:
-        found = align(PointCloud(source), PointCloud(target), options, threads)
+        found = align(PointCloud(source), PointCloud(target), options, threads, hints=False)
         return Estimate(found.T_target_source, found.status, found.confidence)
 
     return run

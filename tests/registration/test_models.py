@@ -33,9 +33,10 @@ def test_one_file_holds_both_encoders_and_the_verdict_and_registration_uses_all(
     from fmr_cli.io import read_cloud
     from fmr_cli.io.weights import weights_bytes
     from fmr_cli.registration import Options, prepare
-    from fmr_cli.registration.confidence import Judge, bundled_weights
+    from fmr_cli.registration.confidence import Judge
     from fmr_cli.registration.models import model
     from fmr_cli.registration.pair import make_pair
+    from fmr_cli.registration.verdict_weights import bundled_weights
 
     given = {f: np.asarray(v).tolist() for f, v in vars(bundled_weights()).items()}
     given["verdict"][0] += 1.0

@@ -22,7 +22,8 @@ from fmr_cli.synthetic import scenes
 from fmr_cli.training.local_views import PATCH_RADIUS, aliases
 from fmr_cli.training.loop import Trainer
 from fmr_cli.training.recipe import ScanRecipe
-from fmr_cli.training.scan_task import ROUNDS, ScanTask, held_out, local_start, read_rounds
+from fmr_cli.training.scan_material import ROUNDS, held_out, read_rounds
+from fmr_cli.training.scan_task import ScanTask, local_start
 from fmr_cli.training.scan_views import (
     Overlapping,
     drawn_views,
@@ -230,15 +231,16 @@ def test_the_file_is_a_whole_model(tmp_path, files):
     assert kept.local.key == model().local.key or run.progress.best > 0
     text = "\n".join(run.task.card())
     assert "Round 1" in text
-    assert not run.task.held_out & {n for p in run.task.rounds[0].pairs if run.task.trains(p) for n in p.ends}
+    material = run.task.material
+    assert not material.held_out & {n for p in material.rounds[0].pairs if material.trains(p) for n in p.ends}
 
 
 def test_one_scan_alone_learns_from_its_parts(tmp_path, files):
     task = ScanTask(replace(TINY, rounds=1, steps=2), files[0][:1], CPU, None, None)
     notes = finish(Trainer(task, tmp_path))
     assert "one scan" in notes[0]
-    assert task.views["single"]
-    assert task.tests["held-out scans"]
+    assert task.material.views["single"]
+    assert task.material.tests["held-out scans"]
 
 
 def test_forgetting_counts_as_no_gain(files):
