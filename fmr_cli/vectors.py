@@ -54,7 +54,7 @@ def find_vectors(attributes: Mapping[str, np.ndarray]) -> list[Vector]:
     return found
 
 
-def spellings(name: str, rest: re.Match) -> Iterable[tuple[str, ...]]:
+def spellings(name: str, rest: re.Match[str]) -> Iterable[tuple[str, ...]]:
     """The triples that a name may begin: x at its start or end, or 0 at its end."""
     if rest[1]:
         yield tuple(letter + rest[1] for letter in ("xyz" if name[0] == "x" else "XYZ"))

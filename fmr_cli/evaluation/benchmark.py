@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -189,5 +190,5 @@ def summarise(rows: Iterable[Outcome], by_scene: bool) -> list[Summary]:
     return found
 
 
-def mean(values: list) -> float:
+def mean(values: Sequence[float | np.floating[Any]]) -> float:
     return float(np.mean(values)) if values else np.nan

@@ -213,7 +213,7 @@ def prepare_file(lib: Any, file: Any, survey: Survey) -> None:
 class ScanSink:
     """One scan of a file that is written: its points in its own frame."""
 
-    def __init__(self, lib: Any, file: Any, first: PointCloud, survey: Survey, fields: list) -> None:
+    def __init__(self, lib: Any, file: Any, first: PointCloud, survey: Survey, fields: list[str]) -> None:
         from scipy.spatial.transform import Rotation
 
         self.fields = fields

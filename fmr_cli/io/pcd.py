@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -196,7 +196,7 @@ def write(path: Path, stream: CloudStream) -> list[str]:
     rests = RESTS if coordinate == "<f4" and survey.rest > 0 else ()
     if rests and survey.rest > NOTABLE * (survey.high - survey.low).max():
         warnings.append(f"most readers of PCD take float32 only and will round coordinates by up to {survey.rest:.2g}")
-    layout: list[tuple] = [(axis, coordinate) for axis in "xyz"]
+    layout: list[tuple[Any, ...]] = [(axis, coordinate) for axis in "xyz"]
     layout += [(f.name, "<" + f.dtype.str[1:], f.shape) for f in fields]
     layout += [("rgba", "<u4") if len(packed) == 4 else ("rgb", "<f4")] if packed else []
     dtype = np.dtype(layout + [(name, "<f8") for name in rests])

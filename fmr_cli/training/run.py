@@ -13,8 +13,8 @@ import torch
 import fmr_cli
 from fmr_cli.errors import FmrError
 from fmr_cli.io.files import check_readable
-from fmr_cli.io.folders import find_scans
-from fmr_cli.multiway.scans import Scan, names, natural
+from fmr_cli.io.folders import find_scans, natural
+from fmr_cli.multiway.scans import Scan, names
 from fmr_cli.registration.models import Device, pick_device
 from fmr_cli.training.data import read_data
 from fmr_cli.training.global_task import GlobalTask, read_start

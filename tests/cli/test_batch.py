@@ -41,8 +41,8 @@ def without_seconds(table):
     return [{name: value for name, value in row.items() if name != "seconds"} for row in table]
 
 
-def test_a_row_for_each_pair_in_the_manifests_order(fmr, folder, truth, pose_error):
-    done = fmr("batch", "pairs.csv", "--out", "out", "--aligned", "--merged", cwd=folder)
+def test_a_row_for_each_pair_in_the_manifests_order(fmr_process, folder, truth, pose_error):
+    done = fmr_process("batch", "pairs.csv", "--out", "out", "--aligned", "--merged", cwd=folder)
     assert done.returncode == 3, done.stderr
     assert "3 aligned, 0 uncertain, 1 failed" in done.stderr
     table = rows(folder)
@@ -97,13 +97,13 @@ def test_a_kill_loses_no_row_and_resume_repeats_none(fmr, folder):
     assert results.read_bytes() == again
 
 
-def test_resume_refuses_another_manifest_and_other_settings(fmr_here, folder):
+def test_resume_refuses_another_manifest_and_other_settings(fmr, folder):
     (folder / "pairs.csv").write_text("source,target\na.ply,missing.ply\n")
     (folder / "other.csv").write_text("source,target\nb.ply,missing.ply\n")
-    assert fmr_here("batch", "pairs.csv", "--out", "out", cwd=folder).returncode == 3
+    assert fmr("batch", "pairs.csv", "--out", "out", cwd=folder).returncode == 3
     before = (folder / "out" / "results.csv").read_bytes()
     for arguments, said in ((["other.csv"], "manifest"), (["pairs.csv", "--seed", 1], "settings")):
-        done = fmr_here("batch", *arguments, "--out", "out", "--resume", cwd=folder)
+        done = fmr("batch", *arguments, "--out", "out", "--resume", cwd=folder)
         assert done.returncode == 2
         assert said in done.stderr
     assert (folder / "out" / "results.csv").read_bytes() == before
@@ -132,17 +132,17 @@ BAD = {
 
 
 @pytest.mark.parametrize("text", BAD.values(), ids=BAD)
-def test_a_bad_manifest_is_one_line_and_leaves_nothing(fmr_here, tmp_path, text):
+def test_a_bad_manifest_is_one_line_and_leaves_nothing(fmr, tmp_path, text):
     if text is not None:
         (tmp_path / "pairs.csv").write_text(text)
-    done = fmr_here("batch", "pairs.csv", "--out", "out", cwd=tmp_path)
+    done = fmr("batch", "pairs.csv", "--out", "out", cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "pairs.csv" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
-def test_an_output_folder_without_a_parent(fmr_here, folder):
-    done = fmr_here("batch", "pairs.csv", "--out", "no/such", cwd=folder)
+def test_an_output_folder_without_a_parent(fmr, folder):
+    done = fmr("batch", "pairs.csv", "--out", "no/such", cwd=folder)
     assert done.returncode == 2
     assert "does not exist" in done.stderr

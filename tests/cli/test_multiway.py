@@ -42,8 +42,10 @@ def result(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in files}
 
 
-def test_what_is_written(fmr, folder, clouds, worst_pose):
-    done = fmr("multiway", "scans", "--out", "out", "--merged", "all.ply", "--aligned", "--anchor", "s2", cwd=folder)
+def test_what_is_written(fmr_process, folder, clouds, worst_pose):
+    done = fmr_process(
+        "multiway", "scans", "--out", "out", "--merged", "all.ply", "--aligned", "--anchor", "s2", cwd=folder
+    )
     assert done.returncode == 0, done.stderr
     assert "4 of 4 scans placed" in done.stderr
     scans = table(folder / "out" / "scans.csv")
@@ -204,11 +206,11 @@ BAD = {
 
 
 @pytest.mark.parametrize(("arguments", "said"), BAD.values(), ids=BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(fmr_here, folder, arguments, said):
+def test_bad_input_is_one_line_and_leaves_nothing(fmr, folder, arguments, said):
     (folder / "empty.csv").write_text("source,target\n")
     before = sorted(folder.rglob("*"))
     out = [] if "--out" in arguments else ["--out", "out"]
-    done = fmr_here("multiway", *arguments, *out, cwd=folder)
+    done = fmr("multiway", *arguments, *out, cwd=folder)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
