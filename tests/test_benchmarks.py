@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import json
-import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -23,10 +26,11 @@ ROOT = Path(__file__).parents[1]
 
 
 def run(module: str, *arguments: str) -> str:
-    command = [sys.executable, "-m", module, *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    """What ``python -m MODULE ARGUMENTS`` prints, run here: to start a process with torch takes seconds."""
+    out = io.StringIO()
+    with mock.patch.object(sys, "argv", [module, *arguments]), contextlib.chdir(ROOT), contextlib.redirect_stdout(out):
+        importlib.import_module(module).main()
+    return out.getvalue()
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -6,11 +6,11 @@ import csv
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
+from command import process_of
 
 from fmr_cli import read_cloud, read_transform, write_cloud
 
@@ -63,19 +63,21 @@ def test_a_row_for_each_pair_in_the_manifests_order(fmr_process, folder, truth, 
 
 
 def test_the_same_results_with_any_number_of_workers_and_as_one_pair(fmr, folder):
-    (folder / "pairs.csv").write_text("source,target\n" + 3 * "a.ply,b.ply\n")
-    for workers in (1, 3):
+    (folder / "pairs.csv").write_text("source,target\n" + 2 * "a.ply,b.ply\n")
+    for workers in (1, 2):
         assert fmr("batch", "pairs.csv", "--out", f"w{workers}", "--workers", workers, cwd=folder).returncode == 0
-    assert without_seconds(rows(folder, "w1")) == without_seconds(rows(folder, "w3"))
+    assert without_seconds(rows(folder, "w1")) == without_seconds(rows(folder, "w2"))
     single = fmr("align", "a.ply", "b.ply", "-q", cwd=folder).stdout
-    for path in (*(folder / "w1/transforms").iterdir(), *(folder / "w3/transforms").iterdir()):
+    for path in (*(folder / "w1/transforms").iterdir(), *(folder / "w2/transforms").iterdir()):
         assert path.read_text() == single
 
 
+@pytest.mark.slow
 def test_a_kill_loses_no_row_and_resume_repeats_none(fmr, folder):
     (folder / "pairs.csv").write_text("source,target\n" + 4 * "a.ply,b.ply\n")
-    command = [sys.executable, "-m", "fmr_cli.cli", "batch", "pairs.csv", "--out", "out", "--workers", "1"]
-    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        process_of("batch", "pairs.csv", "--out", "out", "--workers", "1"), cwd=folder, stderr=subprocess.DEVNULL
+    )
     results = folder / "out" / "results.csv"
     while process.poll() is None and not (results.exists() and results.read_text().count("\n") >= 2):
         time.sleep(0.02)

@@ -72,6 +72,7 @@ held_out_pairs = 2
 """
 
 
+@pytest.mark.slow
 def test_scans_teach_all_that_registration_uses(tmp_path, fmr, samples):
     (tmp_path / "scans.toml").write_text(SCANS)
     (tmp_path / "scans").mkdir()
@@ -90,12 +91,11 @@ def test_scans_teach_all_that_registration_uses(tmp_path, fmr, samples):
     assert "loss_chamfer" in (run / "metrics.csv").read_text()
     names = load_file(run / "model.safetensors")
     assert {name.split(".")[0] for name in names} >= {"encoder", "local"}
-    for command in (
-        ("align", "scans/scan_a.ply", "scans/scan_b.ply"),
-        ("multiway", "scans/scan_a.ply", "scans/scan_b.ply", "--out", "net"),
-    ):
-        used = fmr(*command, "--model", "runs/train/model.safetensors", cwd=tmp_path)
-        assert used.returncode == 0, used.stderr
+    used = fmr(
+        "multiway", "scans/scan_a.ply", "scans/scan_b.ply", "--out", "net", "--workers", 1,
+        "--model", "runs/train/model.safetensors", cwd=tmp_path,
+    )  # fmt: skip
+    assert used.returncode == 0, used.stderr
     again = fmr("train", "--unsupervised", "scans", "--recipe", "runs/train/recipe.toml", "-o", "b", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     a, b = (load_file(tmp_path / run / "state.safetensors") for run in ("runs/train", "b"))
@@ -156,6 +156,7 @@ def test_a_local_recipe_trains_the_encoder_of_patches(tmp_path, fmr, samples):
         assert len(refused.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_kill_and_resume_end_in_the_same_weights(tmp_path, fmr, samples, recipe):
     arguments = ["train", str(samples), "--recipe", str(recipe), "--unsupervised", "--epochs", "4"]
     command = [sys.executable, "-m", "fmr_cli.cli", *arguments, "-o", "killed"]
@@ -208,6 +209,7 @@ def test_ctrl_c_keeps_the_best_so_far(tmp_path, samples, recipe):
     assert (tmp_path / "runs/train/README.md").is_file()
 
 
+@pytest.mark.slow
 def test_two_processes_average_their_gradients(tmp_path, samples, recipe):
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "fmr_cli.cli",
