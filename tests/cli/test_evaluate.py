@@ -11,7 +11,7 @@ QUICK = ("--pairs", "4", "--points", "128", "--clouds", "1", "--no-align")
 
 
 def test_tables_csv_and_plots(tmp_path, fmr, samples):
-    done = fmr("evaluate", samples, *QUICK, "--experiments", "noise, scenes,features", "-o", "out", cwd=tmp_path)
+    done = fmr("evaluate", samples, *QUICK, "--experiments", "noise, scenes", "-o", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "noise: success" in done.stdout
     assert "scenes: success" in done.stdout
@@ -36,6 +36,7 @@ def test_plots_are_png_files(tmp_path, fmr, samples):
         assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_baselines_stand_beside_the_method(tmp_path, fmr, samples):
     done = fmr("evaluate", samples, *QUICK, "--experiments", "scenes", "--no-plain", "--baselines", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

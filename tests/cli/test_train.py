@@ -33,6 +33,7 @@ def recipe(tmp_path):
     return tmp_path / "tiny.toml"
 
 
+@pytest.mark.slow
 def test_train_on_scans_from_the_bundled_weights(tmp_path, fmr, samples):
     (tmp_path / "quick.toml").write_text("held_out_pairs = 2\ncrops = 16\n")
     done = fmr("train", "--unsupervised", samples, "--recipe", "quick.toml", "--minutes", "0.01", cwd=tmp_path)
@@ -102,6 +103,7 @@ def test_scans_teach_all_that_registration_uses(tmp_path, fmr, samples):
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.slow
 def test_labelled_pairs_teach_the_local_encoder_too(tmp_path, fmr, samples):
     (tmp_path / "scans.toml").write_text(
         SCANS.replace("checked = 3", "checked = 0").replace("made_up = 4", "made_up = 0")

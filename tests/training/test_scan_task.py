@@ -108,6 +108,7 @@ def test_a_wrong_link_that_is_not_sure_joins_nothing():
         np.testing.assert_allclose(T, np.linalg.inv(poses[0]) @ poses[i], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_scans_that_share_nothing_and_broken_files_are_said(tmp_path, files):
     rng = np.random.default_rng(0)
     (tmp_path / "broken.ply").write_text("ply\nnothing")
@@ -209,6 +210,7 @@ def finish(trainer: Trainer) -> list[str]:
     return [note for report in trainer.run() for note in report.notes]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_in_its_second_round_goes_on_to_the_same_weights(tmp_path, files):
     whole = trainer(files, tmp_path / "whole")
     notes = finish(whole)
@@ -235,6 +237,7 @@ def test_the_file_is_a_whole_model(tmp_path, files):
     assert not material.held_out & {n for p in material.rounds[0].pairs if material.trains(p) for n in p.ends}
 
 
+@pytest.mark.slow
 def test_one_scan_alone_learns_from_its_parts(tmp_path, files):
     task = ScanTask(replace(TINY, rounds=1, steps=2), files[0][:1], CPU, None, None)
     notes = finish(Trainer(task, tmp_path))
