@@ -1,5 +1,8 @@
-"""PCD: ascii, binary and binary_compressed, of every version. Packed `rgb` becomes red, green, blue; VIEWPOINT the
-sensor's place. A compressed file is one block, which has to be in memory whole."""
+"""PCD: ascii, binary and binary_compressed, of every version.
+
+Packed `rgb` becomes red, green, blue; VIEWPOINT the sensor's place. A compressed file is one block, which has to be in
+memory whole.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +33,8 @@ LZF_LIMIT = 90  # LZF cannot shrink data more than this many times
 
 @dataclass
 class Header:
+    """What the head of the file says."""
+
     fields: np.dtype  # packed, in the file's order; padding fields are called _, __2, ...
     points: int
     viewpoint: tuple[float, ...]  # x y z and a quaternion w x y z; empty where the file has none

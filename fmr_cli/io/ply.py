@@ -36,6 +36,8 @@ LONGEST_HEADER = 1 << 20
 
 @dataclass
 class Property:
+    """A property of an element, as the header declares it."""
+
     name: str
     type: str  # numpy's name, without the byte order
     count_type: str | None = None  # of a list
@@ -43,6 +45,8 @@ class Property:
 
 @dataclass
 class Element:
+    """An element, as the header declares it."""
+
     name: str
     count: int
     properties: list[Property] = field(default_factory=list)
@@ -61,6 +65,8 @@ class Element:
 
 @dataclass
 class Header:
+    """What the head of the file says."""
+
     order: str
     elements: list[Element]
     comments: dict[str, str]

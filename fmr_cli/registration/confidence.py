@@ -82,8 +82,10 @@ def support(x: np.ndarray, weights: Weights) -> np.ndarray:
 
 
 def standing(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """Of distinct poses of one pair, x (n, d) their evidence: what each weighs among the others (n,), the best 1 or
-    less, and how the first of them stands (s,): its evidence, its margins over the others, its support as a logit.
+    """What each of several distinct poses of one pair weighs among the others, and how the first of them stands.
+
+    x: (n, d) their evidence. Weights (n,), the best 1 or less; standing (s,): the first one's evidence, its margins
+    over the others, its support as a logit.
     """
     supports, fits = support(x, weights), x[:, QUALITY] @ weights.fit
     weigh = supports * np.exp(np.clip(fits - fits.max(), -SURE_LOGIT, 0.0))
@@ -102,8 +104,9 @@ def products(standings: np.ndarray, weights: Weights) -> np.ndarray:
 
 
 def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """The probability of each of several distinct poses, x (n, d) their evidence, of which at most one is right; and
-    what each weighs among the others. The first has what the verdict gives it, the others share the rest.
+    """The probability of each of several distinct poses, of which at most one is right; what each weighs among them.
+
+    x: (n, d) their evidence. The first has what the verdict gives it, the others share the rest.
     """
     weigh, first = standing(x, weights)
     p = float(sigmoid(products(first[None], weights)[0] @ weights.verdict))
