@@ -190,5 +190,5 @@ def summarise(rows: Iterable[Outcome], by_scene: bool) -> list[Summary]:
     return found
 
 
-def mean(values: Sequence[float | np.floating[Any]]) -> float:
+def mean(values: Sequence[Any]) -> float:
     return float(np.mean(values)) if values else np.nan

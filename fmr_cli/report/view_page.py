@@ -29,7 +29,7 @@ def write_view(path: Path, clouds: list[PointCloud], by: Coloring, size: float, 
         {"name": c.path.name if c.path else c.name, "points": packed(c.points - middle), "values": {}} for c in few
     ]
     for name in ("height", "intensity", "residual"):
-        values = [values_of(c, name) for c in few]  # type: ignore[arg-type]
+        values = [values_of(c, name) for c in few]
         known = [v for v in values if v is not None and len(v)]
         if not known:
             continue

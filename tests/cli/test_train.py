@@ -139,6 +139,7 @@ def test_the_recipe_of_a_run_gives_the_same_weights_again(tmp_path, fmr, samples
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.slow
 def test_a_local_recipe_trains_the_encoder_of_patches(tmp_path, fmr, samples):
     (tmp_path / "local.toml").write_text('kind = "local"\npairs = 5\npatches = 24\nbatch = 2\nepoch_steps = 2\n')
     done = fmr("train", "--recipe", "local.toml", "--epochs", "1", "-o", "run", cwd=tmp_path)
@@ -178,6 +179,7 @@ def test_kill_and_resume_end_in_the_same_weights(tmp_path, fmr, samples, recipe)
         assert all(torch.equal(killed[key], whole[key]) for key in whole)
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_best_so_far(tmp_path, samples, recipe):
     command = [
         sys.executable,

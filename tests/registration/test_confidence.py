@@ -109,6 +109,7 @@ def test_contradiction_outweighs_matches(against: dict[str, float]) -> None:
     assert said(evidence(**against))[0] < 0.5
 
 
+@pytest.mark.slow
 def test_a_box_that_fits_turned_over_is_not_called_sure() -> None:
     rng = np.random.default_rng(1)
     sides = np.array([1.0, 0.6, 0.35])
