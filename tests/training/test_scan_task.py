@@ -226,7 +226,7 @@ def test_a_run_that_is_killed_in_its_second_round_goes_on_to_the_same_weights(tm
 
 
 def test_the_file_is_a_whole_model(tmp_path, files):
-    run = trainer(files, tmp_path, rounds=1)
+    run = trainer((files[0][:3], files[1]), tmp_path, rounds=1)
     finish(run)
     kept = model(tmp_path / "model.safetensors")
     assert np.array_equal(kept.whole.layers[0][0], model().whole.layers[0][0])
