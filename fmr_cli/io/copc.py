@@ -70,8 +70,9 @@ def cells_of(file: BinaryIO, info: Any, size: int) -> list[Cell]:
 
 
 def wanted_cells(cells: list[Cell], info: Any, wanted: Wanted) -> list[Cell]:
-    """Those within the bounds, down to the level of the resolution; where points at most are wanted, down to the level
-    with which there are enough.
+    """Those within the bounds, down to the level of the resolution.
+
+    Where points at most are wanted, down to the level with which there are enough.
     """
     if wanted.bounds is not None:
         low, high = np.array(wanted.bounds[:3]), np.array(wanted.bounds[3:])
@@ -91,8 +92,10 @@ def wanted_cells(cells: list[Cell], info: Any, wanted: Wanted) -> list[Cell]:
 def records(
     file: BinaryIO, header: laspy.LasHeader, cells: list[Cell], selection: laspy.DecompressionSelection, limit: int
 ) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """The points of the cells, some CHUNK at a time. limit: how many times the points are larger than their chunk at
-    most. Raises CloudFileError where a cell promises more.
+    """The points of the cells, some CHUNK at a time.
+
+    limit: how many times the points are larger than their chunk at most. Raises CloudFileError where a cell promises
+    more.
     """
     laszip = header.vlrs.get("LasZipVlr")[0].record_data
     width = header.point_format.size

@@ -97,6 +97,7 @@ def test_a_client_that_is_given_stays_open(shared):
         assert client.status == "running"
 
 
+@pytest.mark.slow
 def test_a_file_that_one_worker_does_not_see(shared, tmp_path):
     """The third worker has an empty folder in the place of ours."""
     (tmp_path / "scan.ply").write_text("")
@@ -121,6 +122,7 @@ def table(out: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
     """Of four workers one is killed and one stopped; the run is cut off, and gone on with by processes.
 
@@ -158,6 +160,7 @@ def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(share
             assert (tmp_path / "dask" / file).read_bytes() == (tmp_path / "here" / file).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_network_is_the_same(shared, tmp_path):
     """Three scans, of which one is a moved copy of the first one's other points."""
     a, b = (read_cloud(SAMPLES / f"scan_{name}.ply").select(slice(None, None, 10)) for name in "ab")
@@ -175,6 +178,7 @@ def test_a_network_is_the_same(shared, tmp_path):
     assert [link.confidence for link in here.links] == [link.confidence for link in there.links]
 
 
+@pytest.mark.slow
 def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path, monkeypatch, capsys):
     found = []
     experiment = ["--no-align", "--experiments", "noise", "--pairs", "2", "--points", "64"]
@@ -192,6 +196,7 @@ def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path,
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
     for _ in range(4):
         shared.worker()
@@ -201,6 +206,7 @@ def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
     assert [a for a in answers if not isinstance(a, LostError)] == [0, 1, 2, 4, 5]
 
 
+@pytest.mark.slow
 def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monkeypatch):
     with Cluster(tmp_path) as alone:
         monkeypatch.setattr(cluster, "NO_WORKERS", 0.5)
