@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -15,7 +16,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
 from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name, topic_of
-from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
+from fmr_cli.io.stream import CloudStream, Wanted, ahead, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
 from fmr_cli.vectors import unturned
 
@@ -87,20 +88,21 @@ def open_cloud(
     box = checked_bounds(bounds)
     if resolution is not None and module.__name__ != "fmr_cli.io.las":
         raise CloudFileError(f"{path}: has no levels, --resolution needs a COPC (.copc.laz)")
-    wanted = Wanted(attributes, part, bin_columns, box, resolution, enough, topic)
 
-    def chunks() -> Iterator[PointCloud]:
+    def chunks(attributes: bool = attributes) -> Iterator[PointCloud]:
+        wanted = Wanted(attributes, part, bin_columns, box, resolution, enough, topic)
         points = dropped = 0
-        for chunk in guarded(module.read(file, wanted), file):
+        for chunk in ahead(guarded(module.read(file, wanted), file)):
             if isinstance(chunk, Mesh):
                 with naming(file):
                     cloud, form = chunk.sample(mesh_points, seed), "mesh"
             else:
                 cloud, form = chunk, kind
-            finite = np.isfinite(cloud.points).all(axis=1)
-            bad = int(len(finite) - finite.sum())
-            if bad:
-                cloud = cloud.select(finite)
+            finite = np.isfinite(cloud.points)
+            bad = 0
+            if not finite.all():  # point by point takes ten times as long
+                whole = finite.all(axis=1)
+                bad, cloud = int(len(whole) - whole.sum()), cloud.select(whole)
             if box is not None:
                 inside = (cloud.points >= np.array(box[:3])) & (cloud.points <= np.array(box[3:]))
                 cloud = cloud.select(np.flatnonzero(inside.all(axis=1)))
@@ -113,7 +115,7 @@ def open_cloud(
             what = f"none of its {dropped} points has finite coordinates" if dropped else "holds no points"
             raise CloudFileError(f"{path}: {what}, check how it was written")
 
-    return CloudStream(chunks, str(path))
+    return CloudStream(chunks, str(path), bare=partial(chunks, attributes=False))
 
 
 def read_cloud(

@@ -165,7 +165,10 @@ def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
     if not records:
         raise CloudFileError("is compressed and lacks the record that says how, it is damaged: copy it again")
     record = records[0].record_data
-    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(struct.unpack_from("<H", record, 32)[0])]
+    chunk_points, count = struct.unpack_from("<I", record, 12)[0], struct.unpack_from("<H", record, 32)[0]
+    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(count)]
+    if chunk_points == 0 or sum(size for _, size in items) != header.point_format.size:
+        raise CloudFileError("does not say rightly how its points are compressed, it is damaged: copy it again")
     layers = sum(LAYERS.get(kind, size) for kind, size in items if kind >= min(LAYERS))
     file.seek(header.offset_to_point_data)
     table = lazrs.read_chunk_table(file, lazrs.LazVlr(record))

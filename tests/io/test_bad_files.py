@@ -109,6 +109,21 @@ def las_file(path: Path) -> bytearray:
     return bytearray(path.read_bytes())
 
 
+@pytest.mark.parametrize(("place", "kind"), [(12, "<I"), (32, "<H")])  # points of a chunk; items of a point
+def test_a_laz_whose_compression_is_not_said_rightly(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], place: int, kind: str
+) -> None:
+    path = tmp_path / "a.laz"
+    write_cloud(path, PointCloud(np.random.default_rng(0).random((99, 3))))
+    data = bytearray(path.read_bytes())
+    record = data.index(b"laszip encoded") - 2 + 54  # behind the VLR's header
+    struct.pack_into(kind, data, record + place, 0)
+    path.write_bytes(data)
+    with pytest.raises(CloudFileError, match="how its points are compressed, it is damaged: copy it again"):
+        read_cloud(path)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_las_that_promises_too_much(tmp_path: Path, suffix: str) -> None:
     data = las_file(tmp_path / f"a{suffix}")
