@@ -254,14 +254,24 @@ def naming(path: Path) -> Iterator[None]:
         raise CloudFileError(f"{path}: cannot be read as {path.suffix} ({reason(error)}), is it damaged?") from error
 
 
+def parted(path: Path) -> tuple[Path, str]:
+    """The file and the part that FILE#part means; a # may be in either's name, the longest name of a file counts."""
+    places = [at for at, letter in enumerate(path.name) if letter == "#" and at]
+    for at in reversed(places):
+        if path.with_name(path.name[:at]).exists():
+            break
+    else:
+        at = max(places, default=0)
+    return (path.with_name(path.name[:at]) if at else path), path.name[at + 1 :]
+
+
 def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str, Path, str | None]:
     """The module for a path's suffix, which must be among ``suffixes``, and the format's name; the file, and the part
     of it that is meant: FILE#2 is a part of FILE, unless there is a file of that very name.
     """
     part = None
     if "#" in path.name and suffixes is SUFFIXES and not path.exists():
-        name, part = path.name.rsplit("#", 1)
-        path = path.with_name(name) if name else path
+        path, part = parted(path)
     if suffixes is SUFFIXES and is_bag_folder(path):
         return importlib.import_module("fmr_cli.io.bags"), "bag", path, part
     packed = path.suffix.lower() == ".gz"

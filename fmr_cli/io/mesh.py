@@ -155,7 +155,7 @@ def read_obj(lines: Lines) -> Parsed:
         if kind == "v":
             vertices.append(numbers(lines, rest[:3], 3))
             if len(rest) in (6, 7):
-                colors.append(numbers(lines, rest[3:6], 3))
+                colors.append(numbers(lines, rest[3:], len(rest) - 3))
         elif kind == "f":
             corners = [int(n) for n in numbers(lines, [word.split("/")[0] for word in rest], len(rest))]
             faces.append([n - 1 if n > 0 else len(vertices) + n for n in corners])

@@ -150,8 +150,7 @@ class Dialect:
     def tidy(self, line: str) -> str:
         """The line as numpy's reader takes it."""
         if self.trailing:
-            line = line.rstrip()
-            line = line.removesuffix(self.delimiter or "")
+            line = line.rstrip(" \r\n").removesuffix(self.delimiter or "")
         return line.replace(",", ".") if self.decimal_comma else line
 
     def cells(self, line: str) -> list[str]:
