@@ -1,6 +1,6 @@
 """Many pairs: throughput by workers, what a Dask scheduler costs a pair, and what a million pairs would take.
 
-    python -m benchmarks.scale workers     # pairs of 12,000 points, by 1, 2, 4 processes and as many Dask workers, in turn
+    python -m benchmarks.scale workers     # pairs of 12,000 points, in turn by 1, 2, 4 processes and Dask workers
     python -m benchmarks.scale scheduler   # 100, 1,000, 10,000 tasks that carry the messages of a pair, and do nothing
     python -m benchmarks.scale pairs       # 100 and 1,000 real pairs of 1,000 points, by two processes
     python -m benchmarks.scale paper       # a million pairs on 1,000 cores, from the figures that the others left

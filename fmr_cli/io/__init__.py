@@ -278,6 +278,8 @@ def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str,
     suffix = path.with_suffix("").suffix.lower() if packed else path.suffix.lower()
     full = f"{suffix}.gz" if packed else suffix
     if full not in suffixes:
+        if path.is_dir():
+            raise CloudFileError(f"{path}: is a folder, give a file in it")
         what = f"the suffix {full!r} cannot be {'read' if suffixes is SUFFIXES else 'written'}"
         raise CloudFileError(f"{path}: {what if full else 'has no suffix'}, use one of {' '.join(suffixes)}")
     module, kind = FORMATS[suffix]
