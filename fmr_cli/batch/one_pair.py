@@ -14,6 +14,7 @@ from fmr_cli.batch.manifest import Pair
 from fmr_cli.batch.results import COLUMNS
 from fmr_cli.errors import FmrError, ModelError
 from fmr_cli.io import WRITABLE, open_cloud, write_cloud
+from fmr_cli.io.addresses import located
 from fmr_cli.io.files import reason
 from fmr_cli.registration import Options, Registration, align
 from fmr_cli.registration.export import aligned_cloud, merged_cloud, metrics
@@ -58,7 +59,7 @@ class PairRunner:
     cached_points: int
 
     def files(self, pair: Pair) -> tuple[Path, Path]:
-        return self.folder / pair.source, self.folder / pair.target
+        return located(self.folder, pair.source), located(self.folder, pair.target)
 
     def do(self, block: Block) -> list[Done]:
         """The block's pairs. Raises ModelError, and UnfitError where this machine lacks a file that others have."""
