@@ -223,8 +223,12 @@ def fan(
         lengths = np.fromiter(map(len, faces), np.int64, len(faces))
         which = [np.flatnonzero(lengths == k) for k in np.unique(lengths)]
         groups = [(np.array([faces[i] for i in index.tolist()], np.int64), index) for index in which]
-    parts = [(g[:, [0, i, i + 1]], index) for g, index in groups if g.ndim == 2 for i in range(1, g.shape[1] - 1)]
-    if not parts:
-        return np.empty((0, 3), np.int64), {name: values[:0] for name, values in of_faces.items()}
-    origin = np.concatenate([index for _, index in parts])
-    return np.concatenate([p for p, _ in parts]), {name: values[origin] for name, values in of_faces.items()}
+    triangles, origin = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    for corners, index in groups:
+        if corners.ndim == 2 and corners.shape[1] >= 3:
+            second, third = corners[:, 1:-1].T, corners[:, 2:].T  # all polygons' first triangles come first
+            first = np.broadcast_to(corners[:, 0], second.shape)
+            triangles.append(np.stack([first, second, third], -1).reshape(-1, 3))
+            origin.append(np.tile(index, len(second)))
+    which = np.concatenate(origin)
+    return np.concatenate(triangles), {name: values[which] for name, values in of_faces.items()}

@@ -25,12 +25,11 @@ from fmr_cli.io.fields import (
     unique,
 )
 from fmr_cli.io.stream import COLORS, CloudStream, Wanted
-from fmr_cli.io.table import COMMENTS, ROWS, THOUSANDS, Dialect, Lines, Rows, number_in, open_text, parse
+from fmr_cli.io.table import COMMENTS, MOST_COLUMNS, ROWS, THOUSANDS, Dialect, Lines, Rows, number_in, open_text, parse
 
 HEAD = 200  # lines that are looked at to tell how the file is written
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 PTS = ("intensity", *COLORS)  # what a PTS line may hold after x y z, in that order
-MOST_COLUMNS = 10_000
 PREAMBLE = 30  # lines before the names, at most
 SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
