@@ -159,6 +159,23 @@ def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(share
             assert (tmp_path / "dask" / file).read_bytes() == (tmp_path / "here" / file).read_bytes()
 
 
+def test_a_worker_whose_disk_is_full_is_left_out(shared, tmp_path):
+    """One worker may write no file of more than 512 bytes: the same as far as it can tell."""
+    cloud = read_cloud(SAMPLES / "scan_a.ply").select(slice(None, None, 8))
+    write_cloud(tmp_path / "a.ply", cloud)
+    (tmp_path / "pairs.csv").write_text("source,target,init\n" + 6 * "a.ply,a.ply,identity\n")
+    full, said = shared.worker(prefix=("sh", "-c", 'ulimit -f 1 && exec "$@"', "sh")), []
+    try:
+        with DaskWorkers(shared.address, say=said.append) as workers:
+            have(workers, 3)
+            rows = align_batch(tmp_path / "pairs.csv", tmp_path / "out", aligned=True, workers=workers)
+    finally:
+        full.kill()
+    assert [row["status"] for row in rows] == 6 * ["aligned"]
+    assert len([*(tmp_path / "out" / "aligned").iterdir()]) == 6
+    assert any("left out" in line and "cannot be written (File too large)" in line for line in said)
+
+
 def test_a_network_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
     """Four scans, of which two are moved copies of the others' other points; one worker is killed, one stopped."""
     T = np.array([[0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1.0]])
