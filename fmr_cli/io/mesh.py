@@ -230,5 +230,5 @@ def fan(
             first = np.broadcast_to(corners[:, 0], second.shape)
             triangles.append(np.stack([first, second, third], -1).reshape(-1, 3))
             origin.append(np.tile(index, len(second)))
-    which = np.concatenate(origin)
-    return np.concatenate(triangles), {name: values[which] for name, values in of_faces.items()}
+    face = np.concatenate(origin)
+    return np.concatenate(triangles), {name: values[face] for name, values in of_faces.items()}
