@@ -116,6 +116,9 @@ def context_of(header: Header) -> dict[str, Any]:
     vertex = next(e for e in header.elements if e.name == "vertex")
     lists = [f"list property {p.name!r}" for p in vertex.properties if p.count_type]
     others = [f"element {e.name!r}" for e in header.elements if e.name not in ("vertex", "face")]
+    known = ("vertex_indices", "vertex_index", *(() if {*COLORS} & {p.name for p in vertex.properties} else COLORS))
+    faces = [p.name for e in header.elements if e.name == "face" and e.count for p in e.properties]
+    lists += [f"property {name!r} of the faces" for name in faces if name not in known]
     origin = np.array(header.comments.get("sensor_origin", "nan").split(), dtype=np.float64)
     return {
         "left_out": (*lists, *others),

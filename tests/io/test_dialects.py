@@ -178,6 +178,24 @@ def test_colours_of_meshes_come_along(tmp_path: Path, name: str) -> None:
     assert ("alpha" in cloud.attributes) == (name in ("alpha.obj", "a.off", "shares.off"))
 
 
+def test_what_is_left_out_of_faces_is_said(tmp_path: Path) -> None:
+    """Texture coordinates and the like; colours where the vertices have their own."""
+    more = "property list uchar float texcoord\nproperty uchar red\n"
+    text = COLOURED["faces.ply"].replace("property uchar red\n", more).replace("3 0 1 2 255", "3 0 1 2 1 0.5 255")
+    (tmp_path / "a.ply").write_text(text)
+    assert read_cloud(tmp_path / "a.ply").left_out == ("property 'texcoord' of the faces",)
+    own = "property float z\nproperty uchar red\n"
+    text = (
+        COLOURED["faces.ply"]
+        .replace("property float z\n", own)
+        .replace("0 0 0\n1 0 0\n0 1 0", "0 0 0 7\n1 0 0 7\n0 1 0 7")
+    )
+    (tmp_path / "b.ply").write_text(text)
+    cloud = read_cloud(tmp_path / "b.ply")
+    assert cloud.left_out == tuple(f"property {name!r} of the faces" for name in ("red", "green", "blue"))
+    assert {*cloud.attributes["red"]} == {7}
+
+
 def turn() -> np.ndarray:
     """A rotation about an oblique axis, a shift, a scale of 2."""
     from scipy.spatial.transform import Rotation
