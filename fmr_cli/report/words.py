@@ -42,7 +42,7 @@ EVIDENCE = {
     "inlier_rmse": ("RMSE", "of points near the other scan"),
     "offset": ("offset", "distance between the surfaces over their own roughness; about 1 is as good as can be"),
     "turn": ("turn", "angle between the surfaces over their own unevenness; about 1 is as good as can be"),
-    "detail": ("detail", "points explained that lie on none of the three largest planes"),
+    "detail": ("detail", "points explained that lie on none of the three planes of the largest corner"),
     "stretch": ("stretch", "share by which the source would have to grow or shrink to fit better"),
     "votes": ("matching features", "local features that agree with the pose"),
     "repeats": ("repetition", "how much of the scene looks the same elsewhere"),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from fmr_cli.geometry.corner import share_beyond_corner
 from fmr_cli.geometry.normals import neighbours, normals_and_variation
-from fmr_cli.geometry.planes import share_beyond_planes
 from fmr_cli.geometry.voxels import voxel_downsample
 
 EDGE = 0.05
@@ -26,7 +26,7 @@ def ball(rng: np.random.Generator) -> np.ndarray:
 def beyond(points: np.ndarray) -> float:
     points = voxel_downsample(points, EDGE)
     normals = normals_and_variation(points, *neighbours(points, cKDTree(points)))[0]
-    return share_beyond_planes(points, normals, EDGE, np.random.default_rng(0))
+    return share_beyond_corner(points, normals, EDGE, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -53,4 +53,13 @@ def test_of_a_curved_surface_most_is_beyond_its_planes() -> None:
 
 
 def test_no_points_have_nothing_beyond() -> None:
-    assert share_beyond_planes(np.zeros((0, 3)), np.zeros((0, 3)), EDGE, np.random.default_rng(0)) == 0
+    assert share_beyond_corner(np.zeros((0, 3)), np.zeros((0, 3)), EDGE, np.random.default_rng(0)) == 0
+
+
+def test_planes_that_are_parallel_make_no_corner() -> None:
+    """A wall, what stands out from it, and the ground: where along the wall, the fronts tell."""
+    rng = np.random.default_rng(0)
+    wall, front = (rng.uniform(0, 2, (6000, 3)) * [1, 0, 1] + [0, y, 0] for y in (0.0, 0.3))
+    front = front[front[:, 0] % 0.8 < 0.4]
+    ground = rng.uniform(0, 2, (6000, 3)) * [1, 1, 0]
+    assert beyond(np.concatenate([wall, front, ground])) > 0.1
