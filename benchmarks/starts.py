@@ -105,7 +105,7 @@ def starts() -> dict[str, Callable[[Pair], list[Hypothesis]]]:
 
 
 def by_ic(pair: Pair) -> list[Hypothesis]:
-    """The paper's solver from the centroids and from the poses as they are; refined as features' poses, the cheap way."""
+    """The paper's solver from the centroids and from the poses as they are; refined the cheap way, as by features."""
     starts = np.eye(4), pair.enter_centred(np.eye(4))
     return [replace(h, start="features") for T in starts for h in from_solver(pair, T, "centroid")]
 
@@ -202,9 +202,8 @@ def main() -> None:
     print(f"{'start':16s} pairs  found  refined  median s")
     for name, several in outcomes.items():
         found_share, refined_share, seconds = np.array(several, float).T
-        print(
-            f"{name:16s} {len(several):5d}  {found_share.mean():.3f}  {refined_share.mean():.3f}    {np.median(seconds):.3f}"
-        )
+        said = f"{found_share.mean():.3f}  {refined_share.mean():.3f}    {np.median(seconds):.3f}"
+        print(f"{name:16s} {len(several):5d}  {said}")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -80,7 +79,7 @@ class Clouds:
 class Row:
     """What a method did at one level. Rotations in degrees; shifts in units of the normalised cloud.
 
-    success: the share that is right, below 5 deg if not said otherwise. What an experiment does not measure is NaN:
+    success: the share that is right, below 5 deg if not said otherwise. What an experiment does not measure is None:
     limit_median, the median rotation error that noise allows (``cramer_rao``), and limit_ratio, the median of the
     error over it; scale_median, the error of the scale as a share; aligned_right, aligned_wrong, the shares of the
     pairs that are ``aligned`` and right, and ``aligned`` and not.
@@ -99,11 +98,11 @@ class Row:
     rmse_mean: float
     rmse_median: float
     seconds: float
-    limit_median: float = math.nan
-    limit_ratio: float = math.nan
-    scale_median: float = math.nan
-    aligned_right: float = math.nan
-    aligned_wrong: float = math.nan
+    limit_median: float | None = None
+    limit_ratio: float | None = None
+    scale_median: float | None = None
+    aligned_right: float | None = None
+    aligned_wrong: float | None = None
 
 
 def read_clouds(path: Path, count: int | None, points: int, device: torch.device) -> Clouds:
@@ -154,7 +153,7 @@ def at_level(
 
 def make_row(
     experiment: Experiment, clouds: str, method: str, level: float, e: Errors, success: float, seconds: float,
-    **more: float,
+    **more: float | None,
 ) -> Row:  # fmt: skip
     """The row of a method's errors at one level; more: the fields that not every experiment measures."""
     means, medians = ([float(f(x)) for x in (e.rotation, e.translation, e.rmse)] for f in (np.mean, np.median))

@@ -127,7 +127,7 @@ def at_level(
     for name, results in found.items():
         errors = np.stack([error for error, _ in results])
         e = Errors(*errors.T)
-        ratio = float(np.median(e.rotation / limits)) if np.all(limits) else np.nan
+        ratio = float(np.median(e.rotation / limits)) if np.all(limits) else None
         rows.append(make_row(
             experiment, clouds.name if clouds else MADE_UP, name, level, e, e.success,
             float(np.mean([seconds for _, seconds in results])), limit_median=float(np.median(limits)),

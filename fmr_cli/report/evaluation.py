@@ -45,7 +45,7 @@ def solver_table(experiment: Experiment, rows: list[Row]) -> Table:
 
 def last_step_table(experiment: Experiment, rows: list[Row]) -> Table:
     """Median errors, and where there is noise how many times the limit the rotation's are."""
-    limited = any(r.limit_median > 0 for r in rows)
+    limited = any(r.limit_ratio is not None for r in rows)
     shown = Table("clouds", "method", experiment.axis, "rotation deg", "shift / 1000", "s a pair")
     shown.title = f"{experiment.name}: median errors of {rows[0].pairs} pairs each, from near starts"
     if limited:
@@ -56,7 +56,7 @@ def last_step_table(experiment: Experiment, rows: list[Row]) -> Table:
             r.clouds, r.method, f"{r.level:g}", f"{r.rotation_median:.4f}", f"{1000 * r.shift_median:.3f}",
             f"{r.seconds:.3f}",
         ]  # fmt: skip
-        if limited and r.limit_median > 0:
+        if r.limit_ratio is not None:
             cells += [f"{r.limit_median:.4f}", f"{r.limit_ratio:.2f}"]
         shown.add_row(*cells)
     return shown
@@ -72,7 +72,8 @@ def cross_source_table(experiment: Experiment, rows: list[Row]) -> Table:
     for r in rows:
         shown.add_row(
             r.clouds, r.method, f"{r.level:g}", f"{r.success:.2f}", f"{r.aligned_right:.2f}", f"{r.aligned_wrong:.2f}",
-            f"{100 * r.scale_median:.2f} %", f"{r.rotation_median:.2f}", f"{r.shift_median:.4f}", f"{r.seconds:.2f}",
+            f"{100 * (r.scale_median or 0):.2f} %", f"{r.rotation_median:.2f}", f"{r.shift_median:.4f}",
+            f"{r.seconds:.2f}",
         )  # fmt: skip
     return shown
 
@@ -85,7 +86,7 @@ def write_csv(path: Path, rows: list[Row]) -> None:
     text = io.StringIO()
     writer = csv.DictWriter(text, [f.name for f in fields(Row)], lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: "" if value != value else value for name, value in asdict(row).items()} for row in rows)
+    writer.writerows(asdict(row) for row in rows)
     with atomic_write(path) as temporary:
         temporary.write_text(text.getvalue())
 
@@ -95,7 +96,7 @@ def series(rows: list[Row], measure: str) -> list[Series]:
 
     Without the levels at which it was not measured.
     """
-    rows = [r for r in rows if getattr(r, measure) == getattr(r, measure)]  # NaN is not itself
+    rows = [r for r in rows if getattr(r, measure) is not None]
     sets = {r.clouds for r in rows}
     found = []
     for clouds, method in dict.fromkeys((r.clouds, r.method) for r in rows):

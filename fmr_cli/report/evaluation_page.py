@@ -52,7 +52,7 @@ def write_evaluation(path: Path, rows: Sequence[Row], options: dict[str, Any]) -
             "title": name[0].upper() + name[1:], "words": f"{words} Level: {experiment.axis}.",
             "plots": [plot(own, measure, experiment.axis, label) for measure, label in shown],
         })  # fmt: skip
-        measured = [c for c in MORE if any(np.isfinite(getattr(row, c["key"])) for row in own)]
+        measured = [c for c in MORE if any(getattr(row, c["key"]) is not None for row in own)]
         tables[number] = {
             "columns": (*COLUMNS, *measured), "caption": "The same numbers; a click on a heading sorts.",
             "rows": [plain(asdict(row)) | {"status": "", "id": ""} for row in own],
