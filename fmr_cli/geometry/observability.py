@@ -9,6 +9,7 @@ import numpy as np
 from fmr_cli.cloud import transform_points
 from fmr_cli.geometry.kernels import geman_mcclure, geman_mcclure_slope
 from fmr_cli.geometry.point_to_plane import SCALE, linearise, normal_equations
+from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_keys
 
@@ -93,6 +94,14 @@ def sandwich(J: np.ndarray, pull: np.ndarray, slope: np.ndarray, block: np.ndarr
 def pseudo_inverse(A: np.ndarray) -> np.ndarray:
     """Of a symmetric matrix, without the directions that rounding alone holds."""
     return np.linalg.pinv(A, rcond=1e-9, hermitian=True)
+
+
+def about(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """The information (6, 6) of the twist about the origin as that of the twist about ``centre`` (3,)."""
+    shift = np.eye(4)
+    shift[:3, 3] = centre
+    M = adjoint(shift)
+    return M.T @ information @ M
 
 
 def undetermined(info: np.ndarray, length: float, basis: np.ndarray | None = None) -> list[str]:
