@@ -185,8 +185,10 @@ def run_pairs(plan: OnDataset, team: Workers, quiet: bool) -> list[Outcome]:
 def run_experiments(
     chosen: list[str], plan: OnScans, own: OnPairsOfItsOwn, team: int | Workers | None, out: Path, quiet: bool
 ) -> list[Row]:
-    """Experiments: tables printed, results.csv and plots in ``out``. plan: for the paper's; own: for those that make
-    their pairs."""
+    """Experiments: tables printed, results.csv and plots in ``out``.
+
+    plan: for the paper's; own: for those that make their pairs.
+    """
     from fmr_cli.evaluation.catalogue import EXPERIMENTS
     from fmr_cli.report.evaluation import plot, table, write_csv
     from fmr_cli.report.plots import can_plot

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -152,7 +152,7 @@ def at_level(
 
 
 def make_row(
-    experiment: Experiment, clouds: str, method: str, level: float, e: Errors, success: float, seconds: float,
+    experiment: Experiment[Any], clouds: str, method: str, level: float, e: Errors, success: float, seconds: float,
     **more: float | None,
 ) -> Row:  # fmt: skip
     """The row of a method's errors at one level; more: the fields that not every experiment measures."""

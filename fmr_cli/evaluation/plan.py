@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -20,6 +20,7 @@ from fmr_cli.evaluation.methods import Method, baselines, ours, product
 from fmr_cli.registration.models import Device, encoder, fast_encoder, pick_device
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import one_blas_thread
+from fmr_cli.synthetic.cross_source import SENSORS
 from fmr_cli.workers import Workers
 from fmr_cli.workers.base import LostError, UnfitError, kept
 
@@ -123,15 +124,18 @@ class OnScans:
             EXPERIMENTS[name], level, sets[place], methods, self.pairs, self.points, self.compared.seed
         )
 
-    def run(self, experiment: Experiment, team: Workers) -> Generator[list[Row], None, None]:
+    def run(self, experiment: Experiment[Any], team: Workers) -> Generator[list[Row], None, None]:
         """The rows of an experiment, set by set and level by level."""
         return level_by_level(self.rows, experiment, len(self.paths), team)
 
 
 @dataclass(frozen=True)
 class OnPairsOfItsOwn:
-    """The experiments that make their pairs: last steps from near starts, on the scans or without any on made-up ones;
-    cross-source pairs, always made up. As ``OnScans``; points: None for what suits the experiment."""
+    """The experiments that make their pairs: last steps from near starts, and cross-source pairs.
+
+    The former on the scans, without any on made-up ones; the latter always made up. As ``OnScans``; points: None for
+    what suits the experiment.
+    """
 
     paths: tuple[Path, ...]
     clouds: int | None
@@ -146,14 +150,14 @@ class OnPairsOfItsOwn:
 
     def made(self) -> list[Clouds]:
         """The sets of clouds that are given."""
-        return kept(repr(self), self._make)  # type: ignore[no-any-return]
+        return kept(repr(self), self._make)
 
     def _make(self) -> list[Clouds]:
         return [read_clouds(path, self.clouds, self.size, torch.device("cpu")) for path in self.paths]
 
-    def sets(self, experiment: Experiment) -> int:
+    def sets(self, experiment: Experiment[Any]) -> int:
         """How many sets of pairs an experiment has."""
-        return len(cross_source.SENSORS) if experiment.name in cross_source.EXPERIMENTS else max(len(self.paths), 1)
+        return len(SENSORS) if experiment.name in cross_source.EXPERIMENTS else max(len(self.paths), 1)
 
     def rows(self, task: tuple[str, int, int]) -> list[Row]:
         """Every method at one level: (experiment, number of the set, number of the level)."""
@@ -165,13 +169,13 @@ class OnPairsOfItsOwn:
             clouds = sets[place] if sets else None
             return last_step.at_level(EXPERIMENTS[name], level, clouds, self.pairs, self.size, self.seed)
 
-    def run(self, experiment: Experiment, team: Workers) -> Generator[list[Row], None, None]:
+    def run(self, experiment: Experiment[Any], team: Workers) -> Generator[list[Row], None, None]:
         """The rows of an experiment, set by set and level by level."""
         return level_by_level(self.rows, experiment, self.sets(experiment), team)
 
 
 def level_by_level(
-    rows: Callable[[tuple[str, int, int]], list[Row]], experiment: Experiment, sets: int, team: Workers
+    rows: Callable[[tuple[str, int, int]], list[Row]], experiment: Experiment[Any], sets: int, team: Workers
 ) -> Generator[list[Row], None, None]:
     """Rows of (experiment, set, level), for each set and level, by the workers. Raises what lost one of them."""
     for done in team.run(

@@ -35,8 +35,10 @@ Neighbourhoods = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass
 class PatchTemplate:
-    """The target's side. centres (P, 3); radius of the balls; feature (P, C); J (P, C, 6); JtJ (P, 6, 6); count (P,)
-    points in each ball."""
+    """The target's side.
+
+    centres (P, 3); radius of the balls; feature (P, C); J (P, C, 6); JtJ (P, 6, 6); count (P,) points in each ball.
+    """
 
     centres: np.ndarray
     radius: float

@@ -20,7 +20,7 @@ SHARES = ("success", "aligned_right", "aligned_wrong")  # measures that are shar
 TICKS = (0, 1, 2, 5, 10, 20, 50, 100, 180)  # degrees, on an axis that is linear up to 1 and logarithmic beyond
 
 
-def table(experiment: Experiment, rows: list[Row]) -> Table:
+def table(experiment: Experiment[Any], rows: list[Row]) -> Table:
     """A line for each set, method and level; what is shown follows from what the experiment measures."""
     measured = {name for name, _ in experiment.measures}
     if "aligned_right" in measured:
@@ -30,7 +30,7 @@ def table(experiment: Experiment, rows: list[Row]) -> Table:
     return last_step_table(experiment, rows)
 
 
-def solver_table(experiment: Experiment, rows: list[Row]) -> Table:
+def solver_table(experiment: Experiment[Any], rows: list[Row]) -> Table:
     """Success and mean errors."""
     shown = Table("clouds", "method", experiment.axis, "success", "rotation deg", "shift", "RMSE", "s a pair")
     shown.title = f"{experiment.name}: success (below 5 deg), mean (median) errors of {rows[0].pairs} pairs each"
@@ -43,7 +43,7 @@ def solver_table(experiment: Experiment, rows: list[Row]) -> Table:
     return shown
 
 
-def last_step_table(experiment: Experiment, rows: list[Row]) -> Table:
+def last_step_table(experiment: Experiment[Any], rows: list[Row]) -> Table:
     """Median errors, and where there is noise how many times the limit the rotation's are."""
     limited = any(r.limit_ratio is not None for r in rows)
     shown = Table("clouds", "method", experiment.axis, "rotation deg", "shift / 1000", "s a pair")
@@ -62,7 +62,7 @@ def last_step_table(experiment: Experiment, rows: list[Row]) -> Table:
     return shown
 
 
-def cross_source_table(experiment: Experiment, rows: list[Row]) -> Table:
+def cross_source_table(experiment: Experiment[Any], rows: list[Row]) -> Table:
     """Recall, the verdict and the errors."""
     shown = Table(
         "pairs", "method", "strength", "recall", "aligned, right", "aligned, wrong", "scale off", "rotation deg",
@@ -110,7 +110,7 @@ def series(rows: list[Row], measure: str) -> list[Series]:
     return found
 
 
-def plot(path: Path, experiment: Experiment, rows: list[Row]) -> None:
+def plot(path: Path, experiment: Experiment[Any], rows: list[Row]) -> None:
     """What the experiment measures over its levels."""
     if experiment.measures == SOLVER:
         plot_solver(path, experiment, rows)
@@ -126,7 +126,7 @@ def plot(path: Path, experiment: Experiment, rows: list[Row]) -> None:
             plots.curves(axes, series(rows, name), dodge=0.006)
 
 
-def plot_solver(path: Path, experiment: Experiment, rows: list[Row]) -> None:
+def plot_solver(path: Path, experiment: Experiment[Any], rows: list[Row]) -> None:
     """Success (with 95 % binomial intervals) and median rotation error over the levels."""
     with plots.figure(path, plots.PAGE, 2.8) as figure:
         share, degrees = figure.subplots(1, 2)

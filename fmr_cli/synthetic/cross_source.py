@@ -31,8 +31,10 @@ FEWEST_SOLIDS = 5  # of an object: two or three are often symmetric
 
 @dataclass(frozen=True)
 class CrossSourcePair:
-    """source (N, 3), photogrammetric, and target (M, 3); T_target_source (4, 4): the similarity between them; scale:
-    its factor; size: the target's largest extent."""
+    """source (N, 3), photogrammetric, and target (M, 3).
+
+    T_target_source (4, 4): the similarity between them; scale: its factor; size: the target's largest extent.
+    """
 
     source: np.ndarray
     target: np.ndarray

@@ -19,8 +19,10 @@ BOX = 1.1  # times the cloud's bounding box: where outliers are
 
 @dataclass(frozen=True)
 class TwoSamples:
-    """One surface sampled twice, without noise, in one frame. source (N, 3), target (M, 3); normals (N, 3) of the
-    source's points."""
+    """One surface sampled twice, without noise, in one frame.
+
+    source (N, 3), target (M, 3); normals (N, 3) of the source's points.
+    """
 
     source: np.ndarray
     target: np.ndarray
@@ -48,9 +50,12 @@ class Degraded:
 
 @dataclass(frozen=True)
 class NearPair:
-    """source (N, 3), target (M, 3), the pose, and one near it; size: the largest extent; of the source's points that
-    are no outliers and that both saw: where they truly lie in the target's frame, and the normals there, (K, 3) each;
-    variance: of the distance between two noisy samples there, own unit squared, see ``evaluation.cramer_rao``."""
+    """source (N, 3), target (M, 3), the pose and one near it; size: the largest extent.
+
+    common, normals (K, 3): where those of the source's points that are no outliers and that both saw truly lie, in the
+    target's frame, and the normals there; variance: of the distance between two noisy samples, own unit squared, see
+    ``evaluation.cramer_rao``.
+    """
 
     source: np.ndarray
     target: np.ndarray

@@ -68,16 +68,16 @@ def test_bad_input_is_one_line(tmp_path, fmr, samples, arguments, said):
         (("--experiments", "refine,noise,features"), "--experiments noise,features: give folders of scans"),
     ],
 )
-def test_what_needs_scans_says_so(tmp_path, fmr_here, arguments, said):
-    done = fmr_here("evaluate", *arguments, cwd=tmp_path)
+def test_what_needs_scans_says_so(tmp_path, fmr, arguments, said):
+    done = fmr("evaluate", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_last_steps_are_compared_without_any_scans(tmp_path, fmr_here):
+def test_last_steps_are_compared_without_any_scans(tmp_path, fmr):
     few = ("--experiments", "refine-sensors", "--pairs", "1", "--points", "200")
-    done = fmr_here("evaluate", *few, "-o", "out", "--report", "r.html", cwd=tmp_path)
+    done = fmr("evaluate", *few, "-o", "out", "--report", "r.html", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "refine-sensors: median errors of 1 pairs each" in done.stdout
     with (tmp_path / "out/results.csv").open() as file:
@@ -89,9 +89,10 @@ def test_last_steps_are_compared_without_any_scans(tmp_path, fmr_here):
     assert "the limit is the Cramér-Rao bound" in (tmp_path / "r.html").read_text("utf-8")
 
 
-def test_last_steps_are_compared_on_the_scans_given(tmp_path, fmr_here, samples):
+@pytest.mark.slow
+def test_last_steps_are_compared_on_the_scans_given(tmp_path, fmr, samples):
     few = ("--experiments", "refine-noise", "--pairs", "1", "--points", "200", "--clouds", "1")
-    done = fmr_here("evaluate", samples, *few, "-o", "out", cwd=tmp_path)
+    done = fmr("evaluate", samples, *few, "-o", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     with (tmp_path / "out/results.csv").open() as file:
         assert {row["clouds"] for row in csv.DictReader(file)} == {samples.name}
