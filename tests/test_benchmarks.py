@@ -120,6 +120,15 @@ def test_the_pairs_of_starts_are_turned_with_their_truth(room_scans: tuple) -> N
     assert target is room_scans[1]
 
 
+def test_where_the_default_s_pairs_come_from(room_scans: tuple) -> None:
+    source, target = (scan[::4] for scan in room_scans)
+    row = starts.where(iter([(source, target, np.eye(4))]))
+    assert row["pairs"] == 1
+    assert row["right"] == 1
+    assert row["start"] in ("features 1", "rival 1", "search 1")
+    assert 0 < row["IC"] < row["IC look"]  # type: ignore[operator]
+
+
 @pytest.mark.slow
 def test_starts_are_counted_on_a_folder(tmp_path: Path, room_scans: tuple) -> None:
     for name, scan in zip("ab", room_scans, strict=True):

@@ -49,8 +49,10 @@ def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
     return by_planes(pair, T)
 
 
-def by_patches(pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """The pose after the feature metric of local patches, from coarse to fine."""
+def by_patches(
+    pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[float, float], ...], both: bool = False
+) -> np.ndarray:
+    """The pose after the feature metric of local patches, from coarse to fine; by one Jacobian or ``both``."""
     length = pair.boxes[1].unit
     g = T_target_source.copy()
     g[:3, 3] /= length
@@ -60,7 +62,7 @@ def by_patches(pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[floa
         centres = patch_centres(pair, s, t, g, reach) / length
         template = patch_template(pair.encoder.layers, centres, balls(t, reach, length), reach / length)
         look = balls(s, reach, length)
-        g = refine(pair.encoder.layers, template, look, g, PATCH_ITERATIONS, pair.motion.basis()).g
+        g = refine(pair.encoder.layers, template, look, g, PATCH_ITERATIONS, pair.motion.basis(), both).g
     g[:3, 3] *= length
     return g
 

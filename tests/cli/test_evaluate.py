@@ -48,6 +48,7 @@ def test_baselines_stand_beside_the_method(tmp_path, fmr, samples):
     ("arguments", "said"),
     [
         (("--experiments", "colour"), "no such experiment; choose from rotation"),
+        (("--experiments", "refine,colour"), "--experiments colour: no such experiment"),
         (("--model", "none.safetensors"), "none.safetensors: no such model file"),
         (("empty",), "empty: no scan in there"),
     ],
@@ -58,6 +59,43 @@ def test_bad_input_is_one_line(tmp_path, fmr, samples, arguments, said):
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "no SCANS: give a data set or folders of scans, or --experiments refine or cross-source"),
+        (("--experiments", "refine,noise,features"), "--experiments noise,features: give folders of scans"),
+    ],
+)
+def test_what_needs_scans_says_so(tmp_path, fmr, arguments, said):
+    done = fmr("evaluate", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_last_steps_are_compared_without_any_scans(tmp_path, fmr):
+    few = ("--experiments", "refine-sensors", "--pairs", "1", "--points", "200")
+    done = fmr("evaluate", *few, "-o", "out", "--report", "r.html", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "refine-sensors: median errors of 1 pairs each" in done.stdout
+    with (tmp_path / "out/results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4 * 7
+    assert {row["clouds"] for row in rows} == {"made up"}
+    assert all(float(row["limit_median"]) > 0 and float(row["limit_ratio"]) > 0 for row in rows)
+    assert {row["scale_median"] for row in rows} == {""}  # not measured
+    assert "the limit is the Cramér-Rao bound" in (tmp_path / "r.html").read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_last_steps_are_compared_on_the_scans_given(tmp_path, fmr, samples):
+    few = ("--experiments", "refine-noise", "--pairs", "1", "--points", "200", "--clouds", "1")
+    done = fmr("evaluate", samples, *few, "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "out/results.csv").open() as file:
+        assert {row["clouds"] for row in csv.DictReader(file)} == {samples.name}
 
 
 @pytest.fixture(scope="module")
