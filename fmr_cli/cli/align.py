@@ -76,12 +76,7 @@ def align_command(
             moving, fixed = pool.map(read, (source, target), boxes)
         with quick_imports():  # after reading: a bad file is said at once
             from fmr_cli.registration import align, export
-            from fmr_cli.registration.mirror import HINT as MIRRORED
-            from fmr_cli.registration.pipeline import mirror_fits
         found = align(moving, fixed, options, check=bool(metrics or as_json or verbose))
-        if found.status != "aligned" and not options.allow_mirror:
-            fits = mirror_fits(moving, fixed, options)
-            found.warnings += [] if fits is None else [MIRRORED.format(fits)]
     T, said, warnings = found.T_target_source, export.metrics(moving, fixed, found), [*found.warnings]
     files = [
         io.open_cloud(path, bin_columns=named, bounds=box) for path, box in zip((source, target), boxes, strict=True)
@@ -116,7 +111,7 @@ def align_command(
     say(*export.summary(moving, fixed, found), quiet=quiet)
     warn(*warnings, quiet=quiet)
     if view:
-        from fmr_cli.report.view import view_pair
+        from fmr_cli.report.view_window import view_pair
 
         view_pair(files[0], files[1], T)
     if found.status != "aligned":

@@ -277,8 +277,9 @@ def parted(path: Path) -> tuple[Path, str]:
 
 
 def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str, Path, str | None]:
-    """The module for a path's suffix, which must be among ``suffixes``, and the format's name; the file, and the part
-    of it that is meant: FILE#2 is a part of FILE, unless there is a file of that very name.
+    """The module for a path's suffix, which must be among ``suffixes``, and the format's name; the file and its part.
+
+    FILE#2 is a part of FILE, unless there is a file of that very name.
     """
     part = None
     if "#" in path.name and suffixes is SUFFIXES and not path.exists():

@@ -72,8 +72,9 @@ def cells_of(file: BinaryIO, info: Any, size: int, chunks: Collection[tuple[int,
 
 
 def wanted_cells(cells: list[Cell], info: Any, wanted: Wanted) -> list[Cell]:
-    """Those within the bounds, down to the level of the resolution; where points at most are wanted, down to the level
-    with which there are enough.
+    """Those within the bounds, down to the level of the resolution.
+
+    Where points at most are wanted, down to the level with which there are enough.
     """
     if wanted.bounds is not None:
         low, high = np.array(wanted.bounds[:3]), np.array(wanted.bounds[3:])

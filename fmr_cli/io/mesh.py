@@ -20,8 +20,9 @@ FEWEST, MOST = 10_000, 1_000_000  # points sampled by default; in between, as ma
 
 @dataclass
 class Mesh:
-    """Vertices (as a cloud with attributes, not yet checked for NaN), the (M, 3) indices of its triangles, and
-    attributes of the triangles: name -> (M,).
+    """Vertices, the (M, 3) indices of their triangles, and attributes of the triangles: name -> (M,).
+
+    The vertices are a cloud with attributes, not yet checked for NaN.
     """
 
     vertices: PointCloud
@@ -84,6 +85,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
 
 @dataclass
 class Parsed:
+    """What the lines of a mesh file say."""
+
     vertices: list[list[float]]
     faces: list[list[int]]
     colors: list[list[float]]  # three or four numbers for each vertex, or for each face; none where not for all

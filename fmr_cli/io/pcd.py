@@ -1,5 +1,8 @@
-"""PCD: ascii, binary and binary_compressed, of every version. Packed `rgb` becomes red, green, blue; VIEWPOINT the
-sensor's place. A compressed file is one block, which has to be in memory whole."""
+"""PCD: ascii, binary and binary_compressed, of every version.
+
+Packed `rgb` becomes red, green, blue; VIEWPOINT the sensor's place. A compressed file is one block, which has to be in
+memory whole.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -30,6 +33,8 @@ LZF_LIMIT = 90  # LZF cannot shrink data more than this many times
 
 @dataclass
 class Header:
+    """What the head of the file says."""
+
     fields: np.dtype  # packed, in the file's order; padding fields are called _, __2, ...
     points: int
     viewpoint: tuple[float, ...]  # x y z and a quaternion w x y z; empty where the file has none
@@ -199,7 +204,7 @@ def write(path: Path, stream: CloudStream) -> list[str]:
     rests = RESTS if coordinate == "<f4" and survey.rest > 0 else ()
     if rests and survey.rest > NOTABLE * (survey.high - survey.low).max():
         warnings.append(f"most readers of PCD take float32 only and will round coordinates by up to {survey.rest:.2g}")
-    layout: list[tuple] = [(axis, coordinate) for axis in "xyz"]
+    layout: list[tuple[Any, ...]] = [(axis, coordinate) for axis in "xyz"]
     layout += [(f.name, "<" + f.dtype.str[1:], f.shape) for f in fields]
     layout += [("rgba", "<u4") if len(packed) == 4 else ("rgb", "<f4")] if packed else []
     dtype = np.dtype(layout + [(name, "<f8") for name in rests])

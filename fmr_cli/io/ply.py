@@ -36,6 +36,8 @@ LONGEST_HEADER = 1 << 20
 
 @dataclass
 class Property:
+    """A property of an element, as the header declares it."""
+
     name: str
     type: str  # numpy's name, without the byte order
     count_type: str | None = None  # of a list
@@ -43,6 +45,8 @@ class Property:
 
 @dataclass
 class Element:
+    """An element, as the header declares it."""
+
     name: str
     count: int
     properties: list[Property] = field(default_factory=list)
@@ -61,6 +65,8 @@ class Element:
 
 @dataclass
 class Header:
+    """What the head of the file says."""
+
     order: str
     elements: list[Element]
     comments: dict[str, str]
@@ -227,7 +233,7 @@ def read_header(file: BinaryIO) -> Header:
 
 def read_text_lists(lines: Lines, element: Element) -> dict[str, Any]:
     """One element of an ascii file with lists, one row a line; the lists as tuples."""
-    columns: dict[str, list] = {p.name: [] for p in element.properties}
+    columns: dict[str, list[Any]] = {p.name: [] for p in element.properties}
     rows = 0
     for line in islice(lines, element.count):
         words = iter(line.split())
@@ -258,7 +264,7 @@ def read_lists(file: BinaryIO, element: Element, order: str) -> dict[str, Any]:
 
     def row_layout(at: int) -> np.dtype:
         """The dtype of the row at a position, its lists as long as they are there."""
-        layout: list[tuple] = []
+        layout: list[tuple[Any, ...]] = []
         for p in element.properties:
             if p.count_type is None:
                 layout.append((p.name, order + p.type))
@@ -298,7 +304,7 @@ def read_lists(file: BinaryIO, element: Element, order: str) -> dict[str, Any]:
     return finish(element, columns)
 
 
-def finish(element: Element, columns: dict[str, list]) -> dict[str, Any]:
+def finish(element: Element, columns: dict[str, list[Any]]) -> dict[str, Any]:
     """Scalar columns as arrays of the declared type, list columns as they are."""
     return {
         p.name: columns[p.name] if p.count_type else np.array(columns[p.name], np.float64).astype(p.type)

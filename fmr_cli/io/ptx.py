@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ FIELDS = ("intensity", *COLORS)
 
 def scans(path: Path) -> list[ScanPart]:
     """Name, pose and number of points of each scan; they have no names but their numbers."""
-    found: list = []
+    found: list[Any] = []
     with open_text(path) as file:
         lines = Lines(file)
         while (head := read_header(lines, len(found))) is not None:

@@ -41,7 +41,7 @@ GZIP_RATIO, GZIP_LEAST = 25, 10_000_000
 
 @contextmanager
 def open_text(path: Path) -> Iterator[TextIO]:
-    """A text file as str, its line ends as \\n: UTF-8 or UTF-16, with or without a mark, gzip by its first bytes."""
+    """A text file as str, with Unix line ends: UTF-8 or UTF-16, with or without a mark, gzip by its first bytes."""
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
@@ -130,6 +130,8 @@ class Lines:
 
 @dataclass
 class Rows:
+    """Lines of a table that hold points."""
+
     lines: list[str] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)  # of the lines in the file, from 1
 

@@ -12,13 +12,8 @@ on made-up scans that no test uses.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cache
-from importlib.resources import files
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -27,6 +22,7 @@ from fmr_cli.geometry.observability import direction
 from fmr_cli.registration.agreement import Agreement, agreement
 from fmr_cli.registration.models import model
 from fmr_cli.registration.pair import Pair
+from fmr_cli.registration.verdict_weights import Weights
 
 ALIGNED = 0.7  # confidence from which a pose is called aligned
 MOST_STRETCH = 0.05  # a stretch beyond it is as bad
@@ -85,41 +81,6 @@ def detail_log(detail: float) -> float:
     return float(np.log((detail + 5) / 200))
 
 
-@dataclass(frozen=True)
-class Weights:
-    """What the fit gives. support: (d,) of ``Evidence.vector``; fit: (q,) of ``Evidence.quality``.
-
-    mean, std: (s,) of ``standing`` where it was fitted; verdict: (1 + s + s (s + 1) / 2,) of its ``products``.
-    """
-
-    support: np.ndarray
-    fit: np.ndarray
-    mean: np.ndarray
-    std: np.ndarray
-    verdict: np.ndarray
-
-
-@cache
-def bundled_weights() -> Weights:
-    """Those of ``models/verdict.json``."""
-    return as_weights(json.loads((files("fmr_cli.models") / "verdict.json").read_text("utf-8")))
-
-
-def as_weights(given: Mapping[str, Any]) -> Weights:
-    """Those of a JSON object. Raises KeyError where it lacks some."""
-    return Weights(**{f.name: np.array(given[f.name]) for f in fields(Weights)})
-
-
-def weights_of(path: Path | None) -> Weights:
-    """Those that a model brings along, else the bundled ones; also where its own are of another version's evidence."""
-    given, bundled = model(path).verdict, bundled_weights()
-    own = None if given is None or not {f.name for f in fields(Weights)} <= given.keys() else as_weights(given)
-    same = own is not None and all(
-        getattr(own, f.name).shape == getattr(bundled, f.name).shape for f in fields(Weights)
-    )
-    return own if own is not None and same else bundled
-
-
 def sigmoid(logit: np.ndarray) -> np.ndarray:
     """The probability of a logit."""
     return 1 / (1 + np.exp(-np.clip(logit, -SURE_LOGIT, SURE_LOGIT)))
@@ -131,8 +92,10 @@ def support(x: np.ndarray, weights: Weights) -> np.ndarray:
 
 
 def standing(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """Of distinct poses of one pair, x (n, d) their evidence: what each weighs among the others (n,), the best 1 or
-    less, and how the first of them stands (s,): its evidence, its margins over the others, its support as a logit.
+    """What each of several distinct poses of one pair weighs among the others, and how the first of them stands.
+
+    x: (n, d) their evidence. Weights (n,), the best 1 or less; standing (s,): the first one's evidence, its margins
+    over the others, its support as a logit.
     """
     supports, fits = support(x, weights), x[:, QUALITY] @ weights.fit
     weigh = supports * np.exp(np.clip(fits - fits.max(), -SURE_LOGIT, 0.0))
@@ -151,8 +114,9 @@ def products(standings: np.ndarray, weights: Weights) -> np.ndarray:
 
 
 def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """The probability of each of several distinct poses, x (n, d) their evidence, of which at most one is right; and
-    what each weighs among the others. The first has what the verdict gives it, the others share the rest.
+    """The probability of each of several distinct poses, of which at most one is right; what each weighs among them.
+
+    x: (n, d) their evidence. The first has what the verdict gives it, the others share the rest.
     """
     weigh, first = standing(x, weights)
     p = float(sigmoid(products(first[None], weights)[0] @ weights.verdict))
@@ -204,7 +168,7 @@ class Judge:
     weights: Weights = field(init=False)
 
     def __post_init__(self) -> None:
-        self.weights = weights_of(self.pair.options.model)
+        self.weights = model(self.pair.options.model).verdict
 
     def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:
         """Gather the evidence at a pose, and weigh all candidates anew."""

@@ -52,6 +52,7 @@ def align(
     options: Options = Options(),
     threads: int = 2,
     check: bool = False,
+    hints: bool = True,
 ) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
@@ -60,12 +61,17 @@ def align(
 
     threads: 2 for what concerns one cloud alone to be done for both side by side, 1 where pairs run side by side
     already. The answer is the same bit for bit, whatever their number and the machine's. check: also let the paper's IC
-    solver go on from the pose found, see ``Registration.feature_check``. Raises RegistrationError
-    where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
-    contradict each other.
+    solver go on from the pose found, see ``Registration.feature_check``. hints: where the pair is not ``aligned``, also
+    take a quick look whether the source's mirror image fits, and warn; False where many pairs are tried that need not
+    fit. Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or the device,
+    FmrError for options that contradict each other.
     """
     found = as_they_are(source, target, options, threads, check)
-    if not options.allow_mirror or found.status == "aligned":
+    if found.status == "aligned":
+        return found
+    if not options.allow_mirror:
+        fits = mirror_fits(source, target, options) if hints else None
+        found.warnings += [] if fits is None else [mirror.HINT.format(fits)]
         return found
     image = mirror.image(source, options.seed)
     other = as_they_are(image, target, options, threads, check)

@@ -18,7 +18,7 @@ from fmr_cli.io import CloudStream, open_cloud, read_cloud, scan_paths, scans_of
 def pose(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     T = np.eye(4)
-    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     T[:3, 3] = rng.uniform(-50, 50, 3)
     return T
 

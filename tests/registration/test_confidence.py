@@ -13,6 +13,7 @@ from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration import confidence
 from fmr_cli.registration.agreement import agreement
 from fmr_cli.registration.pipeline import align
+from fmr_cli.registration.verdict_weights import bundled_weights
 
 
 def ball(rng: np.random.Generator, noise: float) -> np.ndarray:
@@ -36,7 +37,7 @@ def evidence(**given: float) -> confidence.Evidence:
 
 
 def said(*poses: confidence.Evidence) -> list[float]:
-    return confidence.confidences(np.array([e.vector() for e in poses]), confidence.bundled_weights())[0].tolist()
+    return confidence.confidences(np.array([e.vector() for e in poses]), bundled_weights())[0].tolist()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -121,6 +122,7 @@ def test_a_mere_corner_is_not_called_sure_however_well_it_fits() -> None:
     assert any("three planes" in reason for reason in found.reasons)
 
 
+@pytest.mark.slow
 def test_a_box_that_fits_turned_over_is_not_called_sure() -> None:
     rng = np.random.default_rng(1)
     sides = np.array([1.0, 0.6, 0.35])

@@ -98,6 +98,7 @@ def test_a_client_that_is_given_stays_open(shared):
         assert client.status == "running"
 
 
+@pytest.mark.slow
 def test_a_file_that_one_worker_does_not_see(shared, tmp_path):
     """The third worker has an empty folder in the place of ours."""
     (tmp_path / "scan.ply").write_text("")
@@ -122,6 +123,7 @@ def table(out: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
     """Of four workers one is killed and one stopped; the run is cut off, and gone on with by processes.
 
@@ -159,6 +161,7 @@ def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(share
             assert (tmp_path / "dask" / file).read_bytes() == (tmp_path / "here" / file).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_worker_whose_disk_is_full_is_left_out(shared, tmp_path):
     """One worker may write no file of more than 512 bytes: the same as far as it can tell."""
     cloud = read_cloud(SAMPLES / "scan_a.ply").select(slice(None, None, 8))
@@ -176,6 +179,7 @@ def test_a_worker_whose_disk_is_full_is_left_out(shared, tmp_path):
     assert any("left out" in line and "cannot be written (File too large)" in line for line in said)
 
 
+@pytest.mark.slow
 def test_a_network_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
     """Four scans, of which two are moved copies of the others' other points; one worker is killed, one stopped."""
     T = np.array([[0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1.0]])
@@ -211,6 +215,7 @@ def test_a_network_whose_workers_are_killed_and_stopped_gives_the_same_files(sha
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path, monkeypatch, capsys):
     found = []
     experiment = ["--no-align", "--experiments", "noise", "--pairs", "2", "--points", "64"]
@@ -228,6 +233,7 @@ def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path,
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
     for _ in range(4):
         shared.worker()
@@ -237,6 +243,7 @@ def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
     assert [a for a in answers if not isinstance(a, LostError)] == [0, 1, 2, 4, 5]
 
 
+@pytest.mark.slow
 def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monkeypatch):
     with Cluster(tmp_path) as alone:
         monkeypatch.setattr(cluster, "NO_WORKERS", 0.5)
