@@ -152,7 +152,7 @@ def table(found: dict[str, dict[str, dict[str, float]]]) -> str:
     lines = [f"| | {head} |", "| --- |" + " ---: | ---: |" * len(found)]
     for name in names:
         cells = [
-            f"{row['seconds']:.0f}, {row['cpu_seconds']:.0f} | {row['peak_mib']:.0f}" if row else " | "
+            f"{row['seconds']:.3g}, {row['cpu_seconds']:.3g} | {row['peak_mib']:.0f}" if row else " | "
             for row in (rows.get(name) for rows in found.values())
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
@@ -174,8 +174,9 @@ def main() -> None:
             if shutil.which("CloudCompare") is None:
                 raise SystemExit("--peer needs CloudCompare: apt-get install cloudcompare")
             found.setdefault("ply", {})[f"{given.peer:,}"] = beside_peer(Path(folder), given.peer)
-    for kind in {"las", "ply"} & {*found}:
-        print(table(found[kind]))
+    for kind in ("las", "ply"):
+        if kind in found:
+            print(table(found[kind]))
     if given.out:
         given.out.write_text(json.dumps(found, indent=1) + "\n")
 
