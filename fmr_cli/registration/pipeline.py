@@ -18,8 +18,8 @@ from threadpoolctl import ThreadpoolController
 
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration import hypotheses, mirror, refinement
-from fmr_cli.registration.confidence import LIKELY, Judge
+from fmr_cli.registration import hypotheses, mirror, places, refinement
+from fmr_cli.registration.confidence import ALIGNED, LIKELY, Judge
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -31,6 +31,8 @@ REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
 FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
+PLACES, APART = 4, 10.0  # of a map whose poses are judged, and voxel edges that they lie apart
+CLOSER = 2  # of them that are looked at closer, the second one where the first one was not the place
 FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000))  # the looks after it, while none is sure
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 CHECKS = 5  # iterations of the IC solver from the pose found, where asked for
@@ -128,7 +130,56 @@ def as_they_are(
 
 
 def look(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge:
-    """The poses that were found, weighed against each other; looks get dearer while none is sure."""
+    """The poses that were found, weighed against each other: in a map part by part, else in all of the target."""
+    judge = in_places(source, target, options, threads, time) if places.is_map(source, target, options) else None
+    if judge and judge.sure(LIKELY):
+        return judge
+    whole = at_once(source, target, options, threads, time)
+    return judge if judge and judge.sure(whole.best.confidence) else whole
+
+
+def in_places(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge | None:
+    """What is found in the parts of a map where a glance finds most; None where it has no such parts.
+
+    The best pose is right if it is right in its part, and none of those found elsewhere is.
+    """
+    glances: list[tuple[Pair, list[Hypothesis]]] = []
+    for part in places.parts(source, target, options):
+        with suppress(RegistrationError):
+            pair = make_pair(source, part, options, threads, *FIRST)
+            found = [h for h in features(pair, time) if pair.allowed(h.T_target_source)]
+            if found:
+                glances.append((pair, sorted(found, key=lambda h: -h.score)))
+    looked: list[np.ndarray] = []  # where the source's centre came to lie
+    judges: list[Judge] = []
+    for pair, found in sorted(glances, key=lambda glance: -glance[1][0].score):
+        at = transform_points(pair.leave_centred(found[0].T_target_source), source.centre[None])
+        if len(judges) < PLACES and all(np.linalg.norm(at - other) > APART * pair.edge for other in looked):
+            looked.append(at)
+            judges.append(Judge(pair))
+            consider(judges[-1], found, time)
+    judges = sorted((j for j in judges if j.candidates), key=lambda j: -j.best.confidence)
+    for number, judge in enumerate(judges[:CLOSER]):
+        if not judge.sure(SURE):
+            judges[number] = further(source, judge.pair.target, options, threads, time)
+        if judges[number].sure(ALIGNED):
+            break
+    if not judges:
+        return None
+    judge, *others = sorted(judges, key=lambda j: -j.best.confidence)
+    pair, best = judge.pair, judge.best
+    elsewhere = [
+        replace(j.best, T_target_source=pair.enter_centred(j.pair.leave_centred(j.best.T_target_source)))
+        for j in others
+    ]
+    elsewhere = [c for c in elsewhere if not pair.same(c.T_target_source, best.T_target_source)]
+    alone = float(np.prod([1 - c.confidence for c in elsewhere]))
+    judge.candidates = [replace(best, confidence=best.confidence * alone), *elsewhere, *judge.candidates[1:]]
+    return judge
+
+
+def at_once(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge:
+    """Looks at all of the target, dearer ones while none is sure."""
     if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None and not options.scale:
         with suppress(RegistrationError):  # too few voxels of that size
             judge = Judge(make_pair(source, target, options, threads, *FIRST))
