@@ -13,7 +13,8 @@ import numpy as np
 
 # The name without its x, y or z, in small letters without _ - . and blanks -> what a transform does to it
 DIRECTIONS = ("n", "nor", "norm", "normal", "normals", "pointnormal", "vertexnormal", "dir", "direction",
-              "ray", "raydir", "raydirection", "beam", "beamdirection", "scandirection", "viewdirection",
+              "ray", "raydir", "raydirection", "beam", "beamdir", "beamdirection", "scandir", "scandirection",
+              "viewdir", "viewdirection", "lineofsight",
               "tangent", "axis")  # fmt: skip
 # t: the LAS waveform's direction, coordinates per picosecond. d: scan direction or flow; both turn
 DISPLACEMENTS = ("v", "vel", "velocity", "velocities", "speed", "flow", "sceneflow", "motion", "displacement", "d",

@@ -67,12 +67,14 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
 def record_of(columns: Iterable[str]) -> np.dtype:
     """The record of columns "name" (float32) or "name:type" (numpy's name of the type, little endian)."""
     given = [column.partition(":") for column in columns]
+    names = [name for name, _, _ in given]
+    said = f"--bin-columns {','.join(columns)}:"
+    if not {*"xyz"} <= {*names} or len({*names}) < len(names):
+        raise CloudFileError(f"{said} there must be one x, one y and one z, and each other name once")
     try:
         return np.dtype([(name, np.dtype(kind or "f4").newbyteorder("<")) for name, _, kind in given])
     except TypeError as error:
-        raise CloudFileError(
-            f"--bin-columns {','.join(columns)}: {error}; types are such as f4, f8, u1, u2, i4"
-        ) from None
+        raise CloudFileError(f"{said} {error}; types are such as f4, f8, u1, u2, i4") from None
 
 
 def find_columns(path: Path, size: int) -> tuple[str, ...] | None:

@@ -21,7 +21,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import Field, fields_of, storable, to_cloud, unique
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
-from fmr_cli.io.table import Lines, read_rows
+from fmr_cli.io.table import MOST_COLUMNS, Lines, read_rows
 
 LONGEST_HEADER = 1 << 20
 LINE_END = re.compile(rb"\r\n|\n|\r")
@@ -121,6 +121,9 @@ def read_header(file: BinaryIO) -> Header:
         counts = [int(c) for c in words.get("COUNT", ["1"] * len(names))]
         if not len(names) == len(sizes) == len(kinds) == len(counts) or min(counts) < 0 or max(counts) > 1 << 20:
             raise ValueError
+        columns = sum(counts) if words["DATA"][0].lower() == "ascii" else len(names)
+        if columns > MOST_COLUMNS:
+            raise CloudFileError(f"declares {columns} values of a point, no point has so many")
         types = [f"{kind.lower()}{size}" for kind, size in zip(kinds, sizes, strict=True)]
         if any(kind not in ("f4", "f8", *(k + s for k in "iu" for s in "1248")) for kind in types):
             raise ValueError

@@ -20,7 +20,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import fields_of, storable, to_cloud, unique, write_records
 from fmr_cli.io.mesh import Mesh, fan
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted, collect
-from fmr_cli.io.table import Lines, read_rows
+from fmr_cli.io.table import MOST_COLUMNS, Lines, read_rows
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -122,6 +122,9 @@ def context_of(header: Header) -> dict[str, Any]:
     vertex = next(e for e in header.elements if e.name == "vertex")
     lists = [f"list property {p.name!r}" for p in vertex.properties if p.count_type]
     others = [f"element {e.name!r}" for e in header.elements if e.name not in ("vertex", "face")]
+    known = ("vertex_indices", "vertex_index", *(() if {*COLORS} & {p.name for p in vertex.properties} else COLORS))
+    faces = [p.name for e in header.elements if e.name == "face" and e.count for p in e.properties]
+    lists += [f"property {name!r} of the faces" for name in faces if name not in known]
     origin = np.array(header.comments.get("sensor_origin", "nan").split(), dtype=np.float64)
     return {
         "left_out": (*lists, *others),
@@ -219,6 +222,10 @@ def read_header(file: BinaryIO) -> Header:
     if order is None:
         raise CloudFileError("has a PLY header without a 'format' line")
     for element in elements:
+        if len(element.properties) > MOST_COLUMNS:
+            raise CloudFileError(
+                f"declares {len(element.properties)} properties of a {element.name}, no point has so many"
+            )
         for prop, name in zip(element.properties, unique([p.name for p in element.properties]), strict=True):
             prop.name = name
     return Header(order, elements, comments, number)

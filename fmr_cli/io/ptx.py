@@ -17,6 +17,7 @@ from fmr_cli.io.table import ROWS, Dialect, Lines, open_text, parse
 from fmr_cli.io.transforms import as_transform
 
 HEADER = 10  # lines: columns, rows, the scanner's place and axes, and a transform of four rows
+MANY, FEW = 1000, 10  # scans after each other of fewer points than a scan has
 FIELDS = ("intensity", *COLORS)
 
 
@@ -28,6 +29,8 @@ def scans(path: Path) -> list[ScanPart]:
         while (head := read_header(lines, len(found))) is not None:
             found.append(head)
             skip(lines, head.count)
+            if len(found) > MANY and sum(part.count for part in found[-MANY:]) < FEW * MANY:
+                raise CloudFileError(f"holds {MANY} scans of fewer than {FEW} points each, it is no PTX")
     return found
 
 

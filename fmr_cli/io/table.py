@@ -18,6 +18,7 @@ import numpy as np
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.stream import CHUNK
 
+MOST_COLUMNS = 10_000  # of a point; each costs time, whether or not it holds anything
 LONGEST_LINE = 1 << 20  # characters: a point has some hundred at most
 BLOCK = 1 << 22  # characters read at a time
 ROWS = CHUNK // 4  # lines parsed at a time: each is a Python object until it is parsed
@@ -152,8 +153,7 @@ class Dialect:
     def tidy(self, line: str) -> str:
         """The line as numpy's reader takes it."""
         if self.trailing:
-            line = line.rstrip()
-            line = line.removesuffix(self.delimiter or "")
+            line = line.rstrip(" \r\n").removesuffix(self.delimiter or "")
         return line.replace(",", ".") if self.decimal_comma else line
 
     def cells(self, line: str) -> list[str]:

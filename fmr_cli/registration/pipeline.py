@@ -103,13 +103,15 @@ def as_they_are(
                 lambda x: x if isinstance(x, Prepared) else prepare(x, options.seed), (source, target)
             )
         check_systems(source, target)
-        verdicts = [
-            (factor, look(source if factor == 1.0 else source.scaled(factor), target, given, threads, time))
-            for factor, given in scales(source, target, options)
-        ]
+        verdicts: list[tuple[float, Judge]] = []
+        for factor, given in scales(source, target, options):
+            scaled = source if factor == 1.0 else source.scaled(factor)
+            verdicts.append((factor, look(scaled, target, given, threads, time)))
+            if verdicts[-1][1].sure(SURE):
+                break
         factor, judge = max(verdicts, key=lambda verdict: verdict[1].best.confidence)
         best = judge.best
-        if options.refine and not options.scale:
+        if options.refine:
             with time.stage("polish"):
                 T = refinement.by_geometry(judge.pair, best.T_target_source)
                 best = replace(best, T_target_source=refinement.exact(judge.pair, T))
@@ -180,7 +182,7 @@ def in_places(source: Prepared, target: Prepared, options: Options, threads: int
 
 def at_once(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge:
     """Looks at all of the target, dearer ones while none is sure."""
-    if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None and not options.scale:
+    if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None:
         with suppress(RegistrationError):  # too few voxels of that size
             judge = Judge(make_pair(source, target, options, threads, *FIRST))
             consider(judge, features(judge.pair, time), time)

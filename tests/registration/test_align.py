@@ -244,12 +244,13 @@ def test_a_shift_alone(room_scans: Scans) -> None:
     assert np.array_equal(here.T_target_source[:3, :3], np.eye(3))
 
 
-def test_one_scale_factor(room_scans: Scans) -> None:
+@pytest.mark.parametrize(("factor", "init"), [(1 / 0.9, "features"), (0.3048, "auto"), (1000.0, "auto")])
+def test_one_scale_factor(room_scans: Scans, factor: float, init: str) -> None:
     truth = ANY.copy()
-    truth[:3, :3] *= 1 / 0.9
+    truth[:3, :3] *= factor
     source = before(truth, room_scans[0])
-    here = align(PointCloud(source), PointCloud(room_scans[1]), Options(scale=True, init="features"))
-    assert here.scale == pytest.approx(1 / 0.9, rel=3e-3)
+    here = align(PointCloud(source), PointCloud(room_scans[1]), Options(scale=True, init=init))
+    assert here.scale == pytest.approx(factor, rel=3e-3)
     assert off(here, truth, source)[1] < 0.06
     assert here.status == "aligned"
 

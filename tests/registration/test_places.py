@@ -43,6 +43,7 @@ def rooms() -> Prepared:
     return tiled(list(range(ROWS**2)))
 
 
+@pytest.mark.slow
 def test_the_place_of_a_scan_in_a_map_is_found(rooms: Prepared) -> None:
     source, back = scan(5)
     found = align(source, rooms, threads=1)
@@ -53,6 +54,7 @@ def test_the_place_of_a_scan_in_a_map_is_found(rooms: Prepared) -> None:
     assert found.points["target"] == rooms.read
 
 
+@pytest.mark.slow
 def test_a_scan_of_a_room_that_the_map_has_twice_is_not_sure() -> None:
     source, _ = scan(5)
     found = align(source, tiled([0, 1, 2, 5, 4, 5, 6, 7, 8]), threads=1)

@@ -27,6 +27,7 @@ from fmr_cli.batch import align_batch  # noqa: E402
 from fmr_cli.cli.app import main  # noqa: E402
 from fmr_cli.errors import FmrError  # noqa: E402
 from fmr_cli.multiway import align_many  # noqa: E402
+from fmr_cli.multiway.export import write_network  # noqa: E402
 from fmr_cli.workers import DaskWorkers, cluster, handing  # noqa: E402
 from fmr_cli.workers.base import LostError  # noqa: E402
 
@@ -161,21 +162,57 @@ def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(share
 
 
 @pytest.mark.slow
-def test_a_network_is_the_same(shared, tmp_path):
-    """Three scans, of which one is a moved copy of the first one's other points."""
-    a, b = (read_cloud(SAMPLES / f"scan_{name}.ply").select(slice(None, None, 10)) for name in "ab")
+def test_a_worker_whose_disk_is_full_is_left_out(shared, tmp_path):
+    """One worker may write no file of more than 512 bytes: the same as far as it can tell."""
+    cloud = read_cloud(SAMPLES / "scan_a.ply").select(slice(None, None, 8))
+    write_cloud(tmp_path / "a.ply", cloud)
+    (tmp_path / "pairs.csv").write_text("source,target,init\n" + 6 * "a.ply,a.ply,identity\n")
+    full, said = shared.worker(prefix=("sh", "-c", 'ulimit -f 1 && exec "$@"', "sh")), []
+    try:
+        with DaskWorkers(shared.address, say=said.append) as workers:
+            have(workers, 3)
+            rows = align_batch(tmp_path / "pairs.csv", tmp_path / "out", aligned=True, workers=workers)
+    finally:
+        full.kill()
+    assert [row["status"] for row in rows] == 6 * ["aligned"]
+    assert len([*(tmp_path / "out" / "aligned").iterdir()]) == 6
+    assert any("left out" in line and "cannot be written (File too large)" in line for line in said)
+
+
+@pytest.mark.slow
+def test_a_network_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
+    """Four scans, of which two are moved copies of the others' other points; one worker is killed, one stopped."""
     T = np.array([[0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1.0]])
-    c = read_cloud(SAMPLES / "scan_a.ply").select(slice(3, None, 10)).transformed(T)
-    for name, cloud in zip("abc", (a, b, c), strict=True):
-        write_cloud(tmp_path / f"{name}.ply", cloud)
-    scans = [tmp_path / f"{name}.ply" for name in "abc"]
+    scans = []
+    for name, moved in (("a", "c"), ("b", "d")):
+        cloud = read_cloud(SAMPLES / f"scan_{name}.ply")
+        scans += [tmp_path / f"{name}.ply", tmp_path / f"{moved}.ply"]
+        write_cloud(scans[-2], cloud.select(slice(None, None, 10)))
+        write_cloud(scans[-1], cloud.select(slice(3, None, 10)).transformed(T))
+    killed, stopped = shared.worker(), shared.worker()
+    harmed = []
+
+    def harm(now):
+        if now.stage == "registering" and now.done == 1 and not harmed:
+            killed.kill()
+            stop(stopped)
+            harmed.append(now.total)
+
     with DaskWorkers(shared.address, say=lambda _: None) as workers:
-        have(workers, 2)
-        there = align_many(scans, workers=workers)
+        have(workers, 4)
+        there = align_many(scans, workers=workers, progress=harm)
+    stopped.kill()
     here = align_many(scans, workers=2)
-    assert len(here.links) == 3
-    assert np.array_equal([s.T_component_scan for s in here.scans], [s.T_component_scan for s in there.scans])
-    assert [link.confidence for link in here.links] == [link.confidence for link in there.links]
+    assert harmed[0] > 1
+    assert len(here.links) == 6
+    found = []
+    for name, network in (("there", there), ("here", here)):
+        (tmp_path / name).mkdir()
+        write_network(network, tmp_path / name)
+        files = {file.relative_to(tmp_path / name): file for file in (tmp_path / name).rglob("*.*")}
+        found.append({path: file.read_bytes() for path, file in files.items() if path.name != "network.json"})
+    assert len(found[0]) == 4 + 6 + 3  # poses, links, tables and graph
+    assert found[0] == found[1]
 
 
 @pytest.mark.slow
