@@ -174,7 +174,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(fmr, folder):
         return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
     journal = folder / "out" / "journal.jsonl"
-    for size, file, extra in ((6_000, "journal.jsonl", ()), (100_000, "all.ply", ("--resume",))):
+    for size, file, extra in ((6_000, "journal.jsonl", ()), (100_000, "out/aligned/s0.ply", ("--resume",))):
         process = started(folder, *extra, preexec_fn=limited(size))
         said = process.communicate()[1]
         assert process.returncode == 2, said
