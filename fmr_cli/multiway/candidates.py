@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from fmr_cli.multiway import looks, visibility
+import numpy as np
+
+from fmr_cli.multiway import consistency, looks, visibility
 from fmr_cli.multiway.looks import Look
 from fmr_cli.multiway.survey import Ends, Survey, ends_of
 
@@ -13,7 +15,7 @@ FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
 NEIGHBOURS = 8  # that most resemble a scan as places, looked at at a time where there are more pairs than that
 PORTIONS = 4  # of so many neighbours, at most, for scans that are still apart
 PROMISING = 0.15  # a look's promise from which a pair is worth registering: pairs without overlap hardly reach it
-ROUGHLY_ONE_PLACE, ROUGHLY_CONTRADICTED = 0.006, 0.012  # as visibility.ONE_PLACE, CONTRADICTED, at a look's rough pose
+ROUGHLY_ONE_PLACE, ROUGHLY = 1.0, 2.0  # as visibility.ONE_PLACE, and contradiction 1, at a look's rough pose
 
 
 def look_at_pairs(survey: Survey) -> None:
@@ -44,22 +46,53 @@ def look_further(survey: Survey) -> bool:
     return bool(pairs)
 
 
-def look_at(survey: Survey, pairs: list[Ends]) -> None:
+def look_closer(survey: Survey) -> bool:
+    """Looks once more, with more keypoints, at pairs of different components; False if there are none.
+
+    Of so many poses, most of them wrong, views have to tell the right ones: of scans taken from one place each.
+    """
+    home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
+    scans = sorted(consistency.telling(survey.links.values()) | {n for n in home if not linked(survey, n)})
+    pairs = [
+        (i, j) for i in scans for j in scans
+        if j < i and home[i] != home[j] and (i, j) in survey.looks
+    ]  # fmt: skip
+    with survey.stage("describe"):
+        needed = sorted({(n, survey.pair_edge(*p)) for p in pairs for n in p})
+        survey.each("describing", lambda which: survey.closer_description(*which), needed)
+    look_at(survey, pairs, closer=True)
+    return bool(pairs)
+
+
+def linked(survey: Survey, number: int) -> bool:
+    """Whether ``align`` is sure of any link of a scan."""
+    return any(number in ends and link.status == "aligned" for ends, link in survey.links.items())
+
+
+def look_at(survey: Survey, pairs: list[Ends], closer: bool = False) -> None:
     """Takes in the looks at some pairs."""
     with survey.stage("look"):
-        survey.looks.update(zip(pairs, survey.each("looking", lambda p: look(survey, p), pairs), strict=True))
+        found = survey.each("looking", lambda p: look(survey, p, closer), pairs)
+        survey.looks.update(zip(pairs, found, strict=True))
     with survey.stage("see through"):
         promising = [p for p in pairs if survey.looks[p].promise >= PROMISING]
         survey.each("finding viewpoints", survey.viewed, sorted({n for p in promising for n in p}))
-        discount_what_is_seen_through(survey, promising)
+        discount_contradicted(survey, promising)
 
 
-def look(survey: Survey, pair: Ends) -> Look:
-    """What the local features of two scans say, without poses that are not allowed."""
+def look(survey: Survey, pair: Ends, closer: bool) -> Look:
+    """What the local features of two scans say, without poses that are not allowed or have been tried."""
     edge = max(survey.pair_edge(*pair), 1e-300)
-    a, b = (survey.description(n, edge) for n in pair)
-    found = looks.look(a, b, survey.motion(*pair, edge))
-    return looks.best_of([x for x in every(found) if survey.allowed(*pair, x.T_target_source)])
+    describe = survey.closer_description if closer else survey.description
+    a, b = (describe(n, edge) for n in pair)
+    found = looks.look(a, b, survey.motion(*pair, edge), looks.CLOSER if closer else 1)
+    link = survey.links.get(pair)
+    tried = np.stack([h.T_target_source for h in link.hypotheses]) if link and link.hypotheses else np.zeros((0, 4, 4))
+
+    def new(T: np.ndarray) -> bool:
+        return bool((looks.displacement(tried, T, a.moment) > consistency.AGREE * edge).all())
+
+    return looks.best_of([x for x in every(found) if survey.allowed(*pair, (T := x.T_target_source)) and new(T)])
 
 
 def every(found: Look) -> list[Look]:
@@ -67,21 +100,20 @@ def every(found: Look) -> list[Look]:
     return [replace(x, others=()) for x in (found, *found.others)]
 
 
-def discount_what_is_seen_through(survey: Survey, pairs: list[Ends]) -> None:
-    """Makes looks less promising where one scan sees through the other; a look's pose is rough, so not by much.
+def discount_contradicted(survey: Survey, pairs: list[Ends]) -> None:
+    """Makes looks less promising where the scans' views contradict them; a look's pose is rough, so not by much.
 
     Nothing is changed where even each scan's best look is contradicted: such scans weren't taken from one place.
     """
 
-    def shares(pair: Ends) -> list[float]:
-        promising = [x for x in every(survey.looks[pair]) if x.promise >= PROMISING]
-        return [survey.seen_through([(*pair, x.T_target_source)]) for x in promising]
+    def views(pair: Ends) -> list[visibility.Seen]:
+        return survey.seen((*pair, x.T_target_source) for x in every(survey.looks[pair]) if x.promise >= PROMISING)
 
-    seen = dict(zip(pairs, survey.each("comparing views", shares, pairs), strict=True))
-    telling = visibility.from_one_place(((p, min(found)) for p, found in seen.items()), ROUGHLY_ONE_PLACE)
+    seen = dict(zip(pairs, survey.each("comparing views", views, pairs), strict=True))
+    telling = visibility.from_one_place([(p, x) for p, found in seen.items() for x in found], ROUGHLY_ONE_PLACE)
     for pair, found in seen.items():
         if pair[0] in telling:
-            factors = (1 / (1 + (share / ROUGHLY_CONTRADICTED) ** 2) for share in found)
+            factors = (1 / (1 + (x.contradiction / ROUGHLY) ** 2) for x in found)
             poses = zip(every(survey.looks[pair]), factors, strict=False)
             survey.looks[pair] = looks.best_of([replace(x, promise=f * x.promise) for x, f in poses])
 

@@ -13,7 +13,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import check_writable
 from fmr_cli.multiway import pose_graph
 from fmr_cli.multiway.adjustment import adjust
-from fmr_cli.multiway.candidates import PORTIONS, look_at_pairs, look_further
+from fmr_cli.multiway.candidates import PORTIONS, look_at_pairs, look_closer, look_further
 from fmr_cli.multiway.known import Known
 from fmr_cli.multiway.network import Network
 from fmr_cli.multiway.reading import prepare
@@ -59,6 +59,9 @@ def align_many(
             if len(survey.components) > 1 and look_further(survey):
                 join_components(survey)
         confirm(survey)
+        if len(survey.components) > 1 and look_closer(survey):
+            join_components(survey)
+            confirm(survey)
         if try_dear_starts(survey):
             join_components(survey)
             confirm(survey)

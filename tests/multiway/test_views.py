@@ -33,13 +33,25 @@ def test_the_viewpoint_is_found_from_the_scan_alone(pair):
 def test_a_scan_sees_through_another_one_only_at_a_wrong_pose(pair):
     ready, truth, views = pair
     T = enter_frames(np.linalg.inv(truth[1]) @ truth[0], ready[0].frame, ready[1].frame)
-    through, said = visibility.contradiction(*views, T)
-    assert said > 1000
-    assert through / said < visibility.CONTRADICTED
+    right = visibility.compare(*views, T)
+    assert right.agreeing > 1000
+    assert right.contradiction < 0.5
     wrong = T.copy()
     wrong[:3, 3] += truth[1][:3, :3].T @ [0.8, 0.0, 0.0]
-    through, said = visibility.contradiction(*views, wrong)
-    assert through / said > 2 * visibility.CONTRADICTED
+    assert visibility.compare(*views, wrong).contradiction > 2
+
+
+def test_rooms_back_to_back_share_a_wall_but_not_a_side_of_it(pair):
+    ready, truth, views = pair
+    points = ready[0].frame.leave(views[0].tree.data) @ truth[0][:3, :3].T + truth[0][:3, 3]
+    beyond = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about the upright through the room's last wall along x
+    beyond[0, 3] = 2 * points[:, 0].max()
+    beyond[1, 3] = points[:, 1].min() + points[:, 1].max()
+    T = enter_frames(np.linalg.inv(truth[1]) @ beyond @ truth[0], ready[0].frame, ready[1].frame)
+    seen = visibility.compare(*views, T)
+    assert seen.through < 0.01 * seen.behind
+    assert seen.behind > 3 * seen.agreeing
+    assert seen.contradiction > 2
 
 
 def test_the_main_directions_of_a_room_are_its_walls_and_a_ball_has_none(pair):
