@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fmr_cli.multiway import consistency, looks, visibility
+from fmr_cli.multiway import consistency, looks, planes, visibility
 from fmr_cli.multiway.looks import Look
 from fmr_cli.multiway.survey import Ends, Survey, ends_of
+from fmr_cli.multiway.visibility import Seen
 
 FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
 NEIGHBOURS = 8  # that most resemble a scan as places, looked at at a time where there are more pairs than that
@@ -19,6 +20,10 @@ PROMISING = 0.15  # a look's promise from which a pair is worth registering: pai
 # building of `python -m benchmarks.multiway` half of the right ones have less than 0.3, 90 % less than 3; of the wrong
 # ones 1 % have less than 3.5, 95 % more than 4.3.
 ROUGHLY_ONE_PLACE, ROUGHLY = 1.0, 2.0
+HOPELESS = 0.05  # of a few points, beyond which the other scan sees: of right poses 95 % have less
+CLOSER = 500  # points of each scan whose views are compared where it is less
+IN_VAIN = 0.3  # trust that a few points leave, from which all are asked
+PLANES = 2.0  # promise of a pose by planes, times what coincides: that of one on which four features agree
 
 
 def look_at_pairs(survey: Survey) -> None:
@@ -49,22 +54,54 @@ def look_further(survey: Survey) -> bool:
     return bool(pairs)
 
 
-def look_closer(survey: Survey) -> bool:
-    """Looks once more, with more keypoints, at pairs of different components; False if there are none.
+def look_by_planes(survey: Survey, most: float) -> bool:
+    """Looks once more, by planes, at pairs of different components, one of ``most`` scans; False if none are left.
 
     Of so many poses, most of them wrong, views have to tell the right ones: of scans taken from one place each.
     """
+    size = {n: len(c.T_component_scan) for c in survey.components for n in c.T_component_scan}
     home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
-    scans = sorted(consistency.telling(survey.links.values()) | {n for n in home if not linked(survey, n)})
+    scans = consistency.telling(survey.links.values()) | {n for n in home if not linked(survey, n)}
+    scans = {n for n in scans if survey.description(n).directions is not None}
     pairs = [
-        (i, j) for i in scans for j in scans
-        if j < i and home[i] != home[j] and (i, j) in survey.looks
+        p for p in sorted(survey.looks.keys() - survey.looked_by_planes)
+        if scans.issuperset(p) and home[p[0]] != home[p[1]] and min(size[n] for n in p) <= most
     ]  # fmt: skip
-    with survey.stage("describe"):
-        needed = sorted({(n, survey.pair_edge(*p)) for p in pairs for n in p})
-        survey.each("describing", lambda which: survey.closer_description(*which), needed)
-    look_at(survey, pairs, closer=True)
+    with survey.stage("see through"):
+        survey.each("finding viewpoints", survey.viewed, sorted({n for p in pairs for n in p}))
+    with survey.stage("look by planes"):
+        found = survey.each("looking", lambda p: by_planes(survey, p), pairs)
+    for pair, more in zip(pairs, found, strict=True):
+        survey.looks[pair] = looks.best_of([*every(survey.looks[pair]), *more])
+    survey.looked_by_planes.update(pairs)
     return bool(pairs)
+
+
+def by_planes(survey: Survey, pair: Ends) -> list[Look]:
+    """Poses at which planes of two scans meet, and neither sees through the other."""
+    a, b = (survey.viewed(n) for n in pair)
+    one, two = (survey.description(n) for n in pair)
+    assert one.directions is not None
+    assert two.directions is not None
+    found = []
+    for T in planes.poses(a, b, (one.directions, two.directions), survey.motion(*pair)):
+        if max(visibility.beyond(b, a, T), visibility.beyond(a, b, np.linalg.inv(T))) > HOPELESS:
+            continue
+        if rough_trust(visibility.compare(a, b, T, CLOSER)) > IN_VAIN and fresh(survey, pair, T):
+            promise = PLANES * rough_trust(visibility.compare(a, b, T)) * looks.coincidence(one, two, T)
+            if promise >= PROMISING:
+                found.append(Look(promise, T))
+    return found
+
+
+def fresh(survey: Survey, pair: Ends, T_target_source: np.ndarray) -> bool:
+    """Whether a pose is allowed, and no attempt at the pair has ended there."""
+    moment, link = survey.moment(pair[0]), survey.links.get(pair)
+    tried = [h.T_target_source for h in link.hypotheses] if link else []
+    near = any(
+        looks.displacement(T, T_target_source, moment) < consistency.AGREE * survey.edges[pair[0]] for T in tried
+    )
+    return not near and survey.allowed(*pair, T_target_source)
 
 
 def linked(survey: Survey, number: int) -> bool:
@@ -72,30 +109,22 @@ def linked(survey: Survey, number: int) -> bool:
     return any(number in ends and link.status == "aligned" for ends, link in survey.links.items())
 
 
-def look_at(survey: Survey, pairs: list[Ends], closer: bool = False) -> None:
+def look_at(survey: Survey, pairs: list[Ends]) -> None:
     """Takes in the looks at some pairs."""
     with survey.stage("look"):
-        found = survey.each("looking", lambda p: look(survey, p, closer), pairs)
-        survey.looks.update(zip(pairs, found, strict=True))
+        survey.looks.update(zip(pairs, survey.each("looking", lambda p: look(survey, p), pairs), strict=True))
     with survey.stage("see through"):
         promising = [p for p in pairs if survey.looks[p].promise >= PROMISING]
         survey.each("finding viewpoints", survey.viewed, sorted({n for p in promising for n in p}))
         discount_contradicted(survey, promising)
 
 
-def look(survey: Survey, pair: Ends, closer: bool) -> Look:
-    """What the local features of two scans say, without poses that are not allowed or have been tried."""
+def look(survey: Survey, pair: Ends) -> Look:
+    """What the local features of two scans say, without poses that are not allowed."""
     edge = max(survey.pair_edge(*pair), 1e-300)
-    describe = survey.closer_description if closer else survey.description
-    a, b = (describe(n, edge) for n in pair)
-    found = looks.look(a, b, survey.motion(*pair, edge), looks.CLOSER if closer else 1)
-    link = survey.links.get(pair)
-    tried = np.stack([h.T_target_source for h in link.hypotheses]) if link and link.hypotheses else np.zeros((0, 4, 4))
-
-    def new(T: np.ndarray) -> bool:
-        return bool((looks.displacement(tried, T, a.moment) > consistency.AGREE * edge).all())
-
-    return looks.best_of([x for x in every(found) if survey.allowed(*pair, (T := x.T_target_source)) and new(T)])
+    a, b = (survey.description(n, edge) for n in pair)
+    found = looks.look(a, b, survey.motion(*pair, edge))
+    return looks.best_of([x for x in every(found) if survey.allowed(*pair, x.T_target_source)])
 
 
 def every(found: Look) -> list[Look]:
@@ -116,9 +145,14 @@ def discount_contradicted(survey: Survey, pairs: list[Ends]) -> None:
     telling = visibility.from_one_place([(p, x) for p, found in seen.items() for x in found], ROUGHLY_ONE_PLACE)
     for pair, found in seen.items():
         if pair[0] in telling:
-            factors = (np.exp(-((x.contradiction / ROUGHLY) ** 2) / 2) for x in found)
+            factors = (rough_trust(x) for x in found)
             poses = zip(every(survey.looks[pair]), factors, strict=False)
             survey.looks[pair] = looks.best_of([replace(x, promise=f * x.promise) for x, f in poses])
+
+
+def rough_trust(seen: Seen) -> float:
+    """What views leave of the promise of a rough pose, from 0 to 1."""
+    return float(np.exp(-((seen.contradiction / ROUGHLY) ** 2) / 2))
 
 
 def untried(survey: Survey, start: str, least: float = PROMISING) -> list[Ends]:

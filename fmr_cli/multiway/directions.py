@@ -63,11 +63,10 @@ def turned(
     similarity: np.ndarray,
     directions: tuple[np.ndarray | None, np.ndarray | None],
     motion: Motion,
-    peaks: int = PEAKS,
 ) -> np.ndarray:
     """Poses (n, 4, 4) between scans with main directions, at the shifts that most keypoints (K, 3), (L, 3) want.
 
-    Lengths in voxel edges. similarity: (K, L) of descriptors. directions: of source and target. peaks: shifts.
+    Lengths in voxel edges. similarity: (K, L) of descriptors. directions: of source and target.
     """
     if directions[0] is None or directions[1] is None or min(similarity.shape) <= NEAREST:
         return np.zeros((0, 4, 4))
@@ -83,7 +82,7 @@ def turned(
     size = cells.max((0, 1)) + 1
     key = ((np.arange(len(R))[:, None] * size[0] + cells[..., 0]) * size[1] + cells[..., 1]) * size[2] + cells[..., 2]
     _, first, count = np.unique(key, return_index=True, return_counts=True)
-    chosen = first[np.argsort(-count, kind="stable")[:peaks]]
+    chosen = first[np.argsort(-count, kind="stable")[:PEAKS]]
     turn, middle = (
         chosen // len(a),
         (cells.reshape(-1, 3)[chosen] + 0.5) * CELL + CELL * np.floor(shifts / CELL).min((0, 1)),

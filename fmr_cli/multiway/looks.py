@@ -7,7 +7,7 @@ scan, on a grid that scans of like size share, so that each scan is described on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.cluster.vq import kmeans2, vq
@@ -17,13 +17,12 @@ from fmr_cli.descriptors.consensus import consensus
 from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.sampling import sample
-from fmr_cli.multiway.directions import PEAKS, main_directions, turned
+from fmr_cli.multiway.directions import main_directions, turned
 from fmr_cli.registration.prepared import LARGEST_RATIO, Prepared
 
 KEYPOINTS = 500
 TOLERANCE = 2.0  # voxel edges that a matched point, or a point and its counterpart, may lie apart
 POSES = 6  # that the matches agree on most; the right one is hardly ever further down
-CLOSER = 4  # times as many keypoints and poses for a closer look
 SAMPLE = 800  # points that are brought onto the other scan
 FEW = 3  # matches that agree: fewer fix no pose
 WORDS = 32  # of the vocabulary that scans are compared by (VLAD)
@@ -60,12 +59,6 @@ class Look:
     others: tuple[Look, ...] = ()
 
 
-def closer(found: Description, scan: Prepared, encoder: LocalEncoder) -> Description:
-    """The same scan with more keypoints."""
-    keypoints, descriptors = scan.described(found.edge, CLOSER * KEYPOINTS, encoder)
-    return replace(found, keypoints=keypoints, descriptors=descriptors)
-
-
 def describe(scan: Prepared, edge: float, encoder: LocalEncoder) -> Description:
     """The scan on a grid of ``edge``."""
     keypoints, descriptors = scan.described(edge, KEYPOINTS, encoder)
@@ -91,20 +84,20 @@ def comparable(a: float, b: float) -> bool:
     return max(a, b) <= 2 * LARGEST_RATIO * min(a, b)
 
 
-def look(source: Description, target: Description, motion: Motion, effort: int = 1) -> Look:
+def look(source: Description, target: Description, motion: Motion) -> Look:
     """Matched descriptors, each the other's nearest; the poses they agree on; how much of the source lies there.
 
     Where both scans have main directions, also the poses that bring them together.
-    motion: what may move, with its lift between the centred frames in edges. effort: times as many poses.
+    motion: what may move, with its lift between the centred frames in edges.
     """
     similarity = source.descriptors @ target.descriptors.T
     forth, back = similarity.argmax(1), similarity.argmax(0)
     mutual = np.flatnonzero(back[forth] == np.arange(len(forth)))
     edge = source.edge
     x, y = source.keypoints[mutual] / edge, target.keypoints[forth[mutual]] / edge
-    poses, _ = consensus(x, y, TOLERANCE, effort * POSES, motion)
+    poses, _ = consensus(x, y, TOLERANCE, POSES, motion)
     more = turned(source.keypoints / edge, target.keypoints / edge, similarity,
-                  (source.directions, target.directions), motion, effort * PEAKS)  # fmt: skip
+                  (source.directions, target.directions), motion)  # fmt: skip
     found: list[Look] = []
     for T in np.concatenate([poses, more]):
         count = int((np.linalg.norm(x @ T[:3, :3].T + T[:3, 3] - y, axis=1) < TOLERANCE).sum())

@@ -75,11 +75,11 @@ class Survey:
         self.frames: dict[int, Frame] = {}
         self.edges: dict[int, float] = {}
         self.described: dict[tuple[int, float], looks.Description] = {}
-        self.described_closer: dict[tuple[int, float], looks.Description] = {}
         self.views: dict[int, visibility.Viewed] = {}
         self.shared: dict[tuple[int, int, bytes], float] = {}  # overlaps that have been worked out already
         self.compared: dict[tuple[int, int, bytes], visibility.Seen] = {}  # views that have been compared already
         self.looks: dict[Ends, looks.Look] = {}
+        self.looked_by_planes: set[Ends] = set()
         self.alike: dict[int, list[int]] = {}  # by scan, those that resemble it as places and wait for a look
         self.links: dict[Ends, Link] = {}
         self.tried: set[tuple[int, int, str]] = set()
@@ -159,13 +159,6 @@ class Survey:
         if (number, edge) not in self.described:
             self.described[number, edge] = looks.describe(self.store.prepared(number), edge, self.local)
         return self.described[number, edge]
-
-    def closer_description(self, number: int, edge: float) -> looks.Description:
-        """The same with more keypoints."""
-        if (number, edge) not in self.described_closer:
-            found = looks.closer(self.description(number, edge), self.store.prepared(number), self.local)
-            self.described_closer[number, edge] = found
-        return self.described_closer[number, edge]
 
     def moment(self, number: int) -> np.ndarray:
         """(4, 4), see ``looks.Description``."""

@@ -37,7 +37,7 @@ DESCENTS, GENERATIONS, DRAWS, ELITE, MANY = 3, 6, 18, 5, 5_000  # from the best 
 AS_GOOD = (
     0.002  # share of hidden points more than at the best place that leaves a scanner where its file has the origin
 )
-SAMPLE = 4_000  # points that are brought into the other scan's view
+SAMPLE, HASTY = 4_000, 250  # points that are brought into the other scan's view, and where most poses are wrong
 
 # Shares of points on the building of `python -m benchmarks.multiway`, with viewpoints found by the scans alone. Seen
 # through: right poses 0.000 to 0.0075, wrong ones of rooms that resemble each other 0.009 to 0.06. From behind, of
@@ -184,15 +184,16 @@ def cells(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return _first[row] + np.minimum((turn * _columns[row]).astype(int), _columns[row] - 1), distance
 
 
-def compare(source: Viewed, target: Viewed, T_target_source: np.ndarray) -> Seen:
-    """What two scans say of each other at a pose."""
-    return total((seen_by(target, source, T_target_source), seen_by(source, target, np.linalg.inv(T_target_source))))
+def compare(source: Viewed, target: Viewed, T_target_source: np.ndarray, count: int = SAMPLE) -> Seen:
+    """What two scans say of each other at a pose, from ``count`` points of each."""
+    inverse = np.linalg.inv(T_target_source)
+    return total((seen_by(target, source, T_target_source, count), seen_by(source, target, inverse, count)))
 
 
-def seen_by(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray) -> Seen:
-    """What a viewer says of those of a scan's points whose surface faces it, on either side."""
+def seen_by(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray, count: int) -> Seen:
+    """What a viewer says of those of a scan's first points whose surface faces it, on either side."""
     R, t = T_viewer_scan[:3, :3], T_viewer_scan[:3, 3]
-    points, normals = scan.some @ R.T + t, scan.normals @ R.T
+    points, normals = scan.some[:count] @ R.T + t, scan.normals[:count] @ R.T
     edge = max(scan.edge, viewer.edge)
     rays = points - viewer.viewpoint
     cell, distance = cells(rays)
@@ -203,6 +204,14 @@ def seen_by(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray) -> Seen:
     met = near & facing
     opposed = np.einsum("ni,ni->n", normals[met], viewer.facing[counterpart[met]]) < OPPOSED
     return Seen(int(through.sum()), int(opposed.sum()), int((~opposed).sum()))
+
+
+def beyond(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray) -> float:
+    """The share of a few of a scan's points beyond which a viewer sees: hasty, without a search for counterparts."""
+    rays = scan.some[:HASTY] @ T_viewer_scan[:3, :3].T + (T_viewer_scan[:3, 3] - viewer.viewpoint)
+    cell, distance = cells(rays)
+    past = (viewer.count[cell] >= SEEN) & (viewer.nearest[cell] > distance * (1 + SLANT) + APART * viewer.edge)
+    return float(past.mean())
 
 
 def from_one_place(found: Iterable[tuple[tuple[int, int], Seen]], bound: float = ONE_PLACE) -> set[int]:
