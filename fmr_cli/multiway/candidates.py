@@ -61,14 +61,18 @@ def look_by_planes(survey: Survey, most: float) -> bool:
     """
     size = {n: len(c.T_component_scan) for c in survey.components for n in c.T_component_scan}
     home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
-    scans = consistency.telling(survey.links.values()) | {n for n in home if not linked(survey, n)}
+    telling = consistency.telling(survey.links.values())
+    if not telling:
+        return False
+    scans = telling | {n for n in home if not linked(survey, n)}
     scans = {n for n in scans if survey.description(n).directions is not None}
+    with survey.stage("see through"):
+        survey.each("finding viewpoints", survey.viewed, sorted(scans))
+    scans = {n for n in scans if survey.viewed(n).hidden <= visibility.NO_PLACE}
     pairs = [
         p for p in sorted(survey.looks.keys() - survey.looked_by_planes)
         if scans.issuperset(p) and home[p[0]] != home[p[1]] and min(size[n] for n in p) <= most
     ]  # fmt: skip
-    with survey.stage("see through"):
-        survey.each("finding viewpoints", survey.viewed, sorted({n for p in pairs for n in p}))
     with survey.stage("look by planes"):
         found = survey.each("looking", lambda p: by_planes(survey, p), pairs)
     for pair, more in zip(pairs, found, strict=True):

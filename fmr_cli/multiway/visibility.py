@@ -42,14 +42,13 @@ SAMPLE, HASTY = 4_000, 250  # points that are brought into the other scan's view
 # Shares of points on the building of `python -m benchmarks.multiway`, with viewpoints found by the scans alone. Seen
 # through: right poses 0.000 to 0.0075, wrong ones of rooms that resemble each other 0.009 to 0.06. From behind, of
 # those with a counterpart: right poses at most 0.001, a wall's one side on its other side 0.22 to 0.48, rooms back to
-# back over 0.9.
+# back over 0.9. Hidden: 0.004 to 0.04, in the median 0.013; of fragments fused from a moving camera 0.04 to 0.11.
 CONTRADICTED = 0.006  # seen through
 FROM_BEHIND = 0.15  # seen from behind
 OPPOSED = -0.5  # cosine of the normals of two near points, each towards its viewpoint, that are two sides of a thing
 LITTLE = 500  # agreeing points that are added to each count, so that a few points of few contradict nothing
-ONE_PLACE = (
-    0.4  # contradiction of each scan's best link, in the median: above it, scans weren't taken from one place each
-)
+HIDDEN, NO_PLACE = 0.03, 0.06  # of points, from the best viewpoint: in the median over scans; of any one scan
+ONE_PLACE = 0.4  # contradiction of each best link, in the median: above it, scans were not taken from one place each
 
 _columns = np.maximum((2 * ROWS * np.sin((np.arange(ROWS) + 0.5) / ROWS * np.pi)).astype(int), 1)
 _first = np.concatenate([[0], np.cumsum(_columns)])  # number of each row's first cell
@@ -60,7 +59,8 @@ class Viewed:
     """A scan as seen from where it was taken; centred. edge: of its grid; tree: of all its points.
 
     facing (M, 3): all points' normals, on the viewpoint's side. some, normals (k, 3): of a few points, likewise.
-    viewpoint (3,). nearest, count: range of the nearest point and number of points in each cell of the range image.
+    viewpoint (3,); hidden: share of points that are hidden from there. nearest, count: range of the nearest point and
+    number of points in each cell of the range image.
     """
 
     edge: float
@@ -69,16 +69,21 @@ class Viewed:
     some: np.ndarray
     normals: np.ndarray
     viewpoint: np.ndarray
+    hidden: float
     nearest: np.ndarray
     count: np.ndarray
 
 
 class Seen(NamedTuple):
-    """What scans say of each other at a pose, in points: seen through, seen from behind, agreeing."""
+    """What scans say of each other at a pose, in points: seen through, seen from behind, agreeing.
+
+    hidden: share of one's own points that are hidden from the place where it seems to have been taken, at most.
+    """
 
     through: int
     behind: int
     agreeing: int
+    hidden: float = 0.0
 
     @property
     def seen_through(self) -> float:
@@ -99,7 +104,8 @@ class Seen(NamedTuple):
 
 def total(seen: Iterable[Seen]) -> Seen:
     """What many pairs say together."""
-    return Seen(*(sum(counts) for counts in zip(Seen(0, 0, 0), *seen, strict=True)))
+    through, behind, agreeing, hidden = zip(Seen(0, 0, 0), *seen, strict=True)
+    return Seen(sum(through), sum(behind), sum(agreeing), max(hidden))
 
 
 def view(scan: Prepared, edge: float) -> Viewed:
@@ -112,7 +118,9 @@ def view(scan: Prepared, edge: float) -> Viewed:
     place = viewpoint(points, normals, fine, scan.frame.enter(np.zeros((1, 3)))[0], rng)
     nearest, count = range_image(points - place)
     facing = towards(place, surface.points, surface.normals)
-    return Viewed(fine, surface.tree, facing, points[:SAMPLE], facing[order[:SAMPLE]], place, nearest, count)
+    some = facing[order[:MANY]]
+    share = hidden((points[:MANY] - place).astype(np.float32), some.astype(np.float32), fine)
+    return Viewed(fine, surface.tree, facing, points[:SAMPLE], some[:SAMPLE], place, share, nearest, count)
 
 
 def towards(place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -185,9 +193,13 @@ def cells(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compare(source: Viewed, target: Viewed, T_target_source: np.ndarray, count: int = SAMPLE) -> Seen:
-    """What two scans say of each other at a pose, from ``count`` points of each."""
+    """What two scans say of each other at a pose, by ``count`` points of each; nothing if no viewpoint explains one."""
+    least = max(source.hidden, target.hidden)
+    if least > NO_PLACE:
+        return Seen(0, 0, 0, least)
     inverse = np.linalg.inv(T_target_source)
-    return total((seen_by(target, source, T_target_source, count), seen_by(source, target, inverse, count)))
+    said = (seen_by(target, source, T_target_source, count), seen_by(source, target, inverse, count))
+    return total(said)._replace(hidden=least)
 
 
 def seen_by(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray, count: int) -> Seen:
@@ -218,19 +230,25 @@ def from_one_place(found: Iterable[tuple[tuple[int, int], Seen]], bound: float =
     """The scans that were taken from one place each, so that their views tell.
 
     found: of pairs (i, j) that may be linked, what they see. Scans that such pairs connect are judged together: each
-    one's least contradiction, in the median, is at most ``bound``; of scans fused from many places it is more.
+    one's least contradiction, in the median, is at most ``bound``, and so is what is hidden of itself at most HIDDEN;
+    of scans fused from many places it is more.
     """
     least: dict[int, float] = {}
+    hidden: dict[int, float] = {}
     home: dict[int, int] = {}
     for (i, j), seen in found:
         for n in (i, j):
             least[n] = min(least.get(n, np.inf), seen.contradiction)
+            hidden[n] = min(hidden.get(n, np.inf), seen.hidden)
             home.setdefault(n, n)
         a, b = home[i], home[j]
         if a != b:
             home = {n: a if h == b else h for n, h in home.items()}
     groups = [[n for n in home if home[n] == g] for g in sorted(set(home.values()))]
-    return {n for g in groups if np.median([least[k] for k in g]) <= bound for n in g}
+    one_place = (
+        g for g in groups if np.median([least[k] for k in g]) <= bound and np.median([hidden[k] for k in g]) <= HIDDEN
+    )
+    return {n for g in one_place for n in g}
 
 
 def doubt(seen: Seen | None) -> float:
