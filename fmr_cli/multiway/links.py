@@ -24,12 +24,14 @@ Status = Literal["aligned", "uncertain", "failed", "rejected"]
 class Hypothesis:
     """A pose that may be right: T_target_source (4, 4) between the centred frames; confidence: that it is.
 
-    aligned: ``align`` has called it so, or it was given. seen: what the scans' views say of it, None until it is known.
+    aligned: ``align`` has called it so, or it was given. firm: it has left no direction open. seen: what the scans'
+    views say of it, None until it is known.
     """
 
     T_target_source: np.ndarray
     confidence: float
     aligned: bool = False
+    firm: bool = False
     seen: Seen | None = None
 
 
@@ -120,8 +122,10 @@ class Journal:
         entry = self.known.get(key)
         if entry is None:
             return None
-        sure = entry["status"] == "aligned"
-        poses = [Hypothesis(np.array(T), c, sure and n == 0) for n, (T, c) in enumerate(entry["hypotheses"])]
+        sure, firm = entry["status"] == "aligned", not entry["message"]
+        poses = [
+            Hypothesis(np.array(T), c, sure and n == 0, firm and n == 0) for n, (T, c) in enumerate(entry["hypotheses"])
+        ]
         return Link(**{**entry, "hypotheses": poses, "information": np.array(entry["information"])})
 
     def keep(self, key: str, link: Link) -> Link:

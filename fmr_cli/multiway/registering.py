@@ -63,9 +63,9 @@ def register(store: Store, task: Attempt) -> Link:
         found = align(a, b, task.options, threads=1)
         poses = [(found.T_target_source, found.confidence)]
         poses += [(np.array(x["T_target_source"]), x["confidence"]) for x in found.alternatives]
-        sure = found.status == "aligned"
+        sure, firm = found.status == "aligned", not found.undetermined
         hypotheses = [
-            Hypothesis(enter_frames(T, a.frame, b.frame), min(float(c), BELOW_GIVEN), sure and n == 0)
+            Hypothesis(enter_frames(T, a.frame, b.frame), min(float(c), BELOW_GIVEN), sure and n == 0, firm and n == 0)
             for n, (T, c) in enumerate(poses)
         ]
         return Link(
@@ -171,7 +171,9 @@ def take_known_links(survey: Survey) -> None:
     """Links that are given, and those that are asked for."""
     for source, target, T in survey.given:
         if source in survey.edges and target in survey.edges:
-            pose = Hypothesis(enter_frames(T, survey.frames[source], survey.frames[target]), 1.0, True, Seen(0, 0, 0))
+            pose = Hypothesis(
+                enter_frames(T, survey.frames[source], survey.frames[target]), 1.0, True, True, Seen(0, 0, 0)
+            )
             edge = survey.pair_edge(source, target)
             sure = np.diag([1 / (edge / survey.radius(target)) ** 2] * 3 + [1 / edge**2] * 3)
             keep(survey, [flipped(Link(source, target, "aligned", "known", [pose], sure, edge=edge, message="given"))])

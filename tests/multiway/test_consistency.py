@@ -156,3 +156,19 @@ def test_where_rooms_resemble_each_other_doubtful_links_that_agree_join_nothing(
     assert [0, 1, 2, 3] in members(doubtful(False)[0])
     assert [0, 1] in members(doubtful(True)[0])
     assert [2, 3] in members(doubtful(True)[0])
+
+
+def test_views_confirm_a_link_that_align_is_shy_of_unless_it_leaves_a_direction_open():
+    def found(firm: bool, seen: Seen):
+        links = [link(1, 0, 0.99), link(3, 2, 0.99), link(2, 0, 0.05)]
+        for x in links[:2]:
+            x.hypotheses[0].seen = Seen(0, 0, 1000)
+        links[2].hypotheses[0].seen, links[2].hypotheses[0].firm = seen, firm
+        return members(components(4, links)[0])
+
+    assert found(True, Seen(0, 0, 1000)) == [[0, 1, 2, 3]]
+    assert found(False, Seen(0, 0, 1000)) == [[0, 1], [2, 3]]
+    assert found(True, Seen(0, 0, 300)) == [[0, 1], [2, 3]], "too few points to say so"
+    assert found(True, Seen(8, 0, 1000)) == [[0, 1], [2, 3]], "something is seen through"
+    assert found(True, Seen(0, 400, 1000)) == [[0, 1], [2, 3]], "a wall from its two sides"
+    assert found(True, Seen(0, 0, 1000, hidden=0.2)) == [[0, 1], [2, 3]], "no viewpoint explains one of the scans"

@@ -109,7 +109,7 @@ def test_planes_alone_tell_where_a_bare_corridor_goes_on():
         n = visibility.towards(place, x, n)
         nearest, count = visibility.range_image(x - place)
         some = visibility.SAMPLE
-        views.append(visibility.Viewed(0.07, cKDTree(x), n, x[:some], n[:some], place, nearest, count))
+        views.append(visibility.Viewed(0.07, cKDTree(x), n, x[:some], n[:some], place, 0.0, nearest, count))
         directions.append(main_directions(n))
     true = frames[1] @ np.linalg.inv(frames[0])
     found = planes.poses(views[0], views[1], (directions[0], directions[1]), Motion())
