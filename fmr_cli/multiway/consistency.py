@@ -232,7 +232,8 @@ def joined(
             continue
         T = joins[a, b].T_second_first
         met = meeting(components[a], components[b], T, scans, moments)
-        given = any(links[n].start == "known" for n in joins[a, b].links)
+        both_parts = components[a].T_component_scan.keys() | components[b].T_component_scan.keys()
+        given = any(link.start == "known" and both_parts.issuperset(link.ends) for link in links)  # whatever views say
         if not given and forbidden(seen(met)):
             join = joins.pop((a, b))
             refused.append(replace(join, denied=join.denied + len(met), sound=False))

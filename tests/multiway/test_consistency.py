@@ -171,4 +171,4 @@ def test_views_confirm_a_link_that_align_is_shy_of_unless_it_leaves_a_direction_
     assert found(True, Seen(0, 0, 300)) == [[0, 1], [2, 3]], "too few points to say so"
     assert found(True, Seen(8, 0, 1000)) == [[0, 1], [2, 3]], "something is seen through"
     assert found(True, Seen(0, 400, 1000)) == [[0, 1], [2, 3]], "a wall from its two sides"
-    assert found(True, Seen(0, 0, 1000, hidden=0.2)) == [[0, 1], [2, 3]], "no viewpoint explains one of the scans"
+    assert found(True, Seen(0, 0, 0, hidden=0.2)) == [[0, 1], [2, 3]], "no viewpoint explains one of the scans"
