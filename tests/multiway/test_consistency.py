@@ -153,9 +153,8 @@ def test_where_rooms_resemble_each_other_doubtful_links_that_agree_join_nothing(
             links[-1].hypotheses[0].aligned = True
         return joined(6, links if not ruled_out else [*links, *alike], dict.fromkeys(range(6), MOMENT), lambda *_: 0.0)
 
-    assert [0, 1, 2, 3] in members(doubtful(False)[0])
-    assert [0, 1] in members(doubtful(True)[0])
-    assert [2, 3] in members(doubtful(True)[0])
+    assert any({0, 1, 2, 3} <= set(scans) for scans in members(doubtful(False)[0]))
+    assert not any({0, 2} <= set(scans) for scans in members(doubtful(True)[0]))
 
 
 def test_views_confirm_a_link_that_align_is_shy_of_unless_it_leaves_a_direction_open():
