@@ -208,13 +208,28 @@ def joined(
         if a != b and link.status != "failed" and not ruled_out:
             silent[a, b].append(number)
 
-    def best(key: tuple[int, int], exact: bool) -> Join:
-        tried = silent[key] if exact else []
-        return best_join(components[key[0]], components[key[1]], links, between[key], tried, moments, overlap, chance)
-
-    # Denials are dear to work out and can but lower a join's odds: only for the join whose turn it is.
-    joins = {key: best(key, exact=False) for key in between}
     refused: list[Join] = []
+
+    def rivals(key: tuple[int, int], exact: bool) -> list[Join]:
+        tried = silent[key] if exact else []
+        one, two = (components[n] for n in key)
+        return joins_between(one, two, links, between[key], tried, moments, overlap, chance) if between[key] else []
+
+    def without_forbidden(key: tuple[int, int]) -> list[Join]:
+        """The rivals that views allow; the others are refused for good, since components only grow."""
+        one, two = (components[n] for n in key)
+        scans_of_both = one.T_component_scan.keys() | two.T_component_scan.keys()
+        if any(link.start == "known" and scans_of_both.issuperset(link.ends) for link in links):  # whatever views say
+            return rivals(key, exact=True)
+        for join in rivals(key, exact=True):
+            met = meeting(one, two, join.T_second_first, scans, moments)
+            if forbidden(seen(met)):
+                refused.append(replace(join, denied=join.denied + len(met), sound=False))
+                between[key] = [claim for claim in between[key] if claim.link not in join.links]
+        return rivals(key, exact=True)
+
+    # Denials and views are dear to work out and can but lower a join's odds: only for the join whose turn it is.
+    joins = {key: found[0] for key in between if (found := rivals(key, exact=False))}
     exact: set[tuple[int, int]] = set()
     while True:
         hopeful = [
@@ -227,21 +242,12 @@ def joined(
         _, a, b = max(hopeful)
         a, b = -a, -b
         if (a, b) not in exact:
-            joins[a, b] = best((a, b), exact=True)
+            del joins[a, b]
+            for join in without_forbidden((a, b))[:1]:
+                joins[a, b] = join
             exact.add((a, b))
             continue
         T = joins[a, b].T_second_first
-        met = meeting(components[a], components[b], T, scans, moments)
-        both_parts = components[a].T_component_scan.keys() | components[b].T_component_scan.keys()
-        given = any(link.start == "known" and both_parts.issuperset(link.ends) for link in links)  # whatever views say
-        if not given and forbidden(seen(met)):
-            join = joins.pop((a, b))
-            refused.append(replace(join, denied=join.denied + len(met), sound=False))
-            exact.discard((a, b))
-            between[a, b] = [claim for claim in between[a, b] if claim.link not in join.links]
-            if between[a, b]:  # another pose, perhaps
-                joins[a, b] = best((a, b), exact=False)
-            continue
         if components[b].held or (
             not components[a].held and len(components[b].T_component_scan) > len(components[a].T_component_scan)
         ):
@@ -256,7 +262,7 @@ def joined(
         for key in [k for k in joins if gone in k]:
             del joins[key]
         exact = {k for k in exact if keep not in k and gone not in k}
-        joins.update({key: best(key, exact=False) for key, some in between.items() if keep in key and some})
+        joins.update({key: found[0] for key in between if keep in key and (found := rivals(key, exact=False))})
     order = sorted(components.values(), key=lambda c: (-len(c.T_component_scan), min(c.T_component_scan)))
     place = {n: k for k, c in enumerate(order) for n in c.T_component_scan}
     left: dict[tuple[int, int], Join] = {}
@@ -295,7 +301,7 @@ def rekeyed(table: dict[tuple[int, int], list], gone: int, keep: int) -> None:
         del table[key]
 
 
-def best_join(
+def joins_between(
     first: Component,
     second: Component,
     links: list[Link],
@@ -304,8 +310,8 @@ def best_join(
     moments: dict[int, np.ndarray],
     overlap: Callable[[int, int, np.ndarray], float],
     chance: float = CHANCE,
-) -> Join:
-    """The pose between two components that most speaks for; its rivals share the probability.
+) -> list[Join]:
+    """The poses between two components that most speaks for, best first; they share the probability.
 
     some: the claims between the two; tried: links between them that may deny it, those that found nothing too.
     """
@@ -343,11 +349,13 @@ def best_join(
             score -= penalty
         sound = len(agreed) > 1 or any(claim.sound for claim in agreed.values())
         best.append(Join(T_agreed, score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
+    best.sort(key=lambda join: -join.log_odds)
     weights = np.exp(np.clip([join.log_odds for join in best], -50, 50))
-    top = int(weights.argmax())
-    rest = float(np.delete(weights, top).max()) if len(weights) > 1 else 0.0
     every = 1 + float(weights.sum())
-    return replace(best[top], probability=float(weights[top]) / every, against=rest / every)
+    return [
+        replace(join, probability=float(w) / every, against=float(np.delete(weights, n).max(initial=0.0)) / every)
+        for n, (join, w) in enumerate(zip(best, weights, strict=True))
+    ]
 
 
 def implied(first: Component, second: Component, link: Link, choice: int) -> np.ndarray:

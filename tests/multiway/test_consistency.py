@@ -143,8 +143,10 @@ def test_where_rooms_resemble_each_other_doubtful_links_that_agree_join_nothing(
     def doubtful(ruled_out):
         links = [link(1, 0, 0.99), link(3, 2, 0.99), link(2, 0, 0.3), link(3, 1, 0.3)]
         alike = [link(5, n, 0.99, right=None) for n in range(4)] + [link(4, n, 0.99, right=None) for n in range(4)]
-        for x in links:
-            x.hypotheses[0].seen = Seen(0, 0, 1000)
+        for x, agreeing in zip(
+            links, (1000, 1000, 0, 0), strict=True
+        ):  # of the doubtful ones views have nothing to say
+            x.hypotheses[0].seen = Seen(0, 0, agreeing)
         for x in alike:
             x.hypotheses[0].seen = Seen(100, 0, 1000) if ruled_out else Seen(0, 0, 1000)
         for n in range(2):  # so that views tell of 4 and 5, too
