@@ -50,7 +50,7 @@ class OnDataset:
 
     def made(self) -> tuple[DataSet, dict[str, benchmark.Method], list[str]]:
         """The data set, the methods by the name in the tables, a line for each method that cannot run here."""
-        return kept(repr(self), self._make)  # type: ignore[no-any-return]
+        return kept(repr(self), self._make)
 
     def _make(self) -> tuple[DataSet, dict[str, benchmark.Method], list[str]]:
         what, found, lines = self.compared, {}, []
@@ -96,7 +96,7 @@ class OnScans:
 
     def made(self) -> tuple[list[Clouds], dict[str, Method], list[str]]:
         """The sets of clouds, the methods by the name in the tables, a line for each method that cannot run here."""
-        return kept(repr(self), self._make)  # type: ignore[no-any-return]
+        return kept(repr(self), self._make)
 
     def _make(self) -> tuple[list[Clouds], dict[str, Method], list[str]]:
         what, lines = self.compared, list[str]()
