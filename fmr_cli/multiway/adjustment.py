@@ -8,7 +8,7 @@ import numpy as np
 
 from fmr_cli.cloud import angle_degrees
 from fmr_cli.geometry.frames import leave_frames
-from fmr_cli.multiway import consistency, joint, looks, pose_graph, visibility
+from fmr_cli.multiway import consistency, joint, looks, pose_graph
 from fmr_cli.multiway.consistency import AGREE, Component, Join
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Apart, Network, Placed
@@ -49,7 +49,8 @@ def adjust(survey: Survey) -> Network:
             scans[n].residual = refined.residual[n]
             scans[n].links = sum(n in link.ends and link.chosen is not None for link in survey.links.values())
         anchors.append(None if component.held else survey.scans[anchor].name)
-    links = [judged(survey, survey.links[ends]) for ends in sorted(survey.links, key=lambda e: (e[1], e[0]))]
+    telling = consistency.telling(survey.links.values())
+    links = [judged(survey, survey.links[ends], telling) for ends in sorted(survey.links, key=lambda e: (e[1], e[0]))]
     counts = {"scans": len(scans), "looked_at": len(survey.looks), "registered": len(survey.tried)}
     return Network(
         scans, links, anchors, apart(survey), survey.frames, counts, survey.seconds, survey.settings(), survey.scans
@@ -94,28 +95,29 @@ def agreeing(survey: Survey, component: Component) -> list[Link]:
     used = []
     poses = component.T_component_scan
     lenient = 1 + 0.1 * np.sqrt(len(poses))
+    telling = consistency.telling(survey.links.values())
     for link in survey.links.values():
         if link.source not in poses or link.target not in poses or not link.hypotheses:
             continue
         expected = np.linalg.inv(poses[link.target]) @ poses[link.source]
-        off = [
-            float(looks.displacement(h.T_target_source, expected, survey.moment(link.source))) for h in link.hypotheses
-        ]
-        best = int(np.argmin(off))
+        T = np.stack([h.T_target_source for h in link.hypotheses])
+        off = looks.displacement(T, expected, survey.moment(link.source))
         both_held = link.source in component.held and link.target in component.held
-        if (
-            off[best] <= AGREE * lenient * link.edge
-            and link.hypotheses[best].confidence >= LEAST_CONFIDENT
-            and not both_held
-        ):
-            link.chosen = best
+        agreed = [
+            k for k, h in enumerate(link.hypotheses)
+            if off[k] <= AGREE * lenient * link.edge and h.confidence >= LEAST_CONFIDENT
+            and not consistency.contradicted(h, link.source in telling)
+        ]  # fmt: skip
+        if agreed and not both_held:
+            link.chosen = min(agreed, key=lambda k: off[k])
             used.append(link)
-            if best > 0 and link.status == "aligned":
+            if link.chosen > 0 and link.status == "aligned":
                 link.message = said(link, "the network has chosen another of its poses")
-        elif link.status == "aligned" and off[best] > AGREE * lenient * link.edge:
+        elif link.status == "aligned" and not agreed:
             link.status = "rejected"
             what = "the poses of the fixed scans" if both_held else "other links"
-            link.message = said(link, f"contradicts {what}: {off[0]:.3g} apart")
+            if off[0] > AGREE * lenient * link.edge:
+                link.message = said(link, f"contradicts {what}: {off[0]:.3g} apart")
     return used
 
 
@@ -180,8 +182,11 @@ def refine(survey: Survey, component: Component, solution: Solution, anchor: int
     return joint.refine(poses, views, pairs, held, motion, survey.workers, priors)
 
 
-def judged(survey: Survey, link: Link) -> Link:
-    """The link with its residuals against the network, if both its scans are in one component."""
+def judged(survey: Survey, link: Link, telling: set[int]) -> Link:
+    """The link with its residuals against the network, if both its scans are in one component.
+
+    telling: the scans whose views tell right poses from wrong ones.
+    """
     home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
     if link.source in home and home[link.source] == home.get(link.target) and link.hypotheses:
         poses = survey.components[home[link.source]].T_component_scan
@@ -193,10 +198,9 @@ def judged(survey: Survey, link: Link) -> Link:
         )
     elif link.status == "aligned":
         link = replace(link, status="rejected", message=said(link, "too much speaks against joining its components"))
-    if link.status == "rejected" and link.source in consistency.telling(list(survey.links.values())):
-        share = link.hypotheses[0].seen_through or 0.0
-        if share > visibility.CONTRADICTED:
-            link.message = said(link, f"one scan sees through {share:.1%} of the other there")
+    h = link.hypotheses[0] if link.hypotheses else None
+    if link.status == "rejected" and h and consistency.contradicted(h, link.source in telling):
+        link.message = said(link, str(h.seen))
     return link
 
 

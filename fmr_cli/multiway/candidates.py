@@ -5,15 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from fmr_cli.multiway import looks, visibility
+import numpy as np
+
+from fmr_cli.multiway import consistency, looks, planes, visibility
 from fmr_cli.multiway.looks import Look
 from fmr_cli.multiway.survey import Ends, Survey, ends_of
+from fmr_cli.multiway.visibility import Seen
 
 FEW_PAIRS = 1_200  # of which every one is looked at: all of 49 scans
 NEIGHBOURS = 8  # that most resemble a scan as places, looked at at a time where there are more pairs than that
 PORTIONS = 4  # of so many neighbours, at most, for scans that are still apart
 PROMISING = 0.15  # a look's promise from which a pair is worth registering: pairs without overlap hardly reach it
-ROUGHLY_ONE_PLACE, ROUGHLY_CONTRADICTED = 0.006, 0.012  # as visibility.ONE_PLACE, CONTRADICTED, at a look's rough pose
+# As visibility.ONE_PLACE; and the contradiction that a look's rough pose may have though it is right, one sigma. On the
+# building of `python -m benchmarks.multiway` half of the right ones have less than 0.3, 90 % less than 3; of the wrong
+# ones 1 % have less than 3.5, 95 % more than 4.3.
+ROUGHLY_ONE_PLACE, ROUGHLY = 1.0, 2.0
+HOPELESS = 0.05  # of a few points, beyond which the other scan sees: of right poses 95 % have less
+CLOSER = 500  # points of each scan whose views are compared where it is less
+IN_VAIN = 0.3  # trust that a few points leave, from which all are asked
+PLANES = 2.0  # promise of a pose by planes, times what coincides: that of one on which four features agree
 
 
 def look_at_pairs(survey: Survey) -> None:
@@ -44,6 +54,65 @@ def look_further(survey: Survey) -> bool:
     return bool(pairs)
 
 
+def look_by_planes(survey: Survey, most: float) -> bool:
+    """Looks once more, by planes, at pairs of different components, one of ``most`` scans; False if none are left.
+
+    Of so many poses, most of them wrong, views have to tell the right ones: of scans taken from one place each.
+    """
+    size = {n: len(c.T_component_scan) for c in survey.components for n in c.T_component_scan}
+    home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
+    telling = consistency.telling(survey.links.values())
+    if not telling:
+        return False
+    scans = telling | {n for n in home if not linked(survey, n)}
+    scans = {n for n in scans if survey.description(n).directions is not None}
+    with survey.stage("see through"):
+        survey.each("finding viewpoints", survey.viewed, sorted(scans))
+    scans = {n for n in scans if survey.viewed(n).hidden <= visibility.NO_PLACE}
+    pairs = [
+        p for p in sorted(survey.looks.keys() - survey.looked_by_planes)
+        if scans.issuperset(p) and home[p[0]] != home[p[1]] and min(size[n] for n in p) <= most
+    ]  # fmt: skip
+    with survey.stage("look by planes"):
+        found = survey.each("looking", lambda p: by_planes(survey, p), pairs)
+    for pair, more in zip(pairs, found, strict=True):
+        survey.looks[pair] = looks.best_of([*every(survey.looks[pair]), *more])
+    survey.looked_by_planes.update(pairs)
+    return bool(pairs)
+
+
+def by_planes(survey: Survey, pair: Ends) -> list[Look]:
+    """Poses at which planes of two scans meet, and neither sees through the other."""
+    a, b = (survey.viewed(n) for n in pair)
+    one, two = (survey.description(n) for n in pair)
+    assert one.directions is not None
+    assert two.directions is not None
+    found = []
+    for T in planes.poses(a, b, (one.directions, two.directions), survey.motion(*pair)):
+        if max(visibility.beyond(b, a, T), visibility.beyond(a, b, np.linalg.inv(T))) > HOPELESS:
+            continue
+        if rough_trust(visibility.compare(a, b, T, CLOSER)) > IN_VAIN and fresh(survey, pair, T):
+            promise = PLANES * rough_trust(visibility.compare(a, b, T)) * looks.coincidence(one, two, T)
+            if promise >= PROMISING:
+                found.append(Look(promise, T))
+    return found
+
+
+def fresh(survey: Survey, pair: Ends, T_target_source: np.ndarray) -> bool:
+    """Whether a pose is allowed, and no attempt at the pair has ended there."""
+    moment, link = survey.moment(pair[0]), survey.links.get(pair)
+    tried = [h.T_target_source for h in link.hypotheses] if link else []
+    near = any(
+        looks.displacement(T, T_target_source, moment) < consistency.AGREE * survey.edges[pair[0]] for T in tried
+    )
+    return not near and survey.allowed(*pair, T_target_source)
+
+
+def linked(survey: Survey, number: int) -> bool:
+    """Whether ``align`` is sure of any link of a scan."""
+    return any(number in ends and link.status == "aligned" for ends, link in survey.links.items())
+
+
 def look_at(survey: Survey, pairs: list[Ends]) -> None:
     """Takes in the looks at some pairs."""
     with survey.stage("look"):
@@ -51,7 +120,7 @@ def look_at(survey: Survey, pairs: list[Ends]) -> None:
     with survey.stage("see through"):
         promising = [p for p in pairs if survey.looks[p].promise >= PROMISING]
         survey.each("finding viewpoints", survey.viewed, sorted({n for p in promising for n in p}))
-        discount_what_is_seen_through(survey, promising)
+        discount_contradicted(survey, promising)
 
 
 def look(survey: Survey, pair: Ends) -> Look:
@@ -67,23 +136,27 @@ def every(found: Look) -> list[Look]:
     return [replace(x, others=()) for x in (found, *found.others)]
 
 
-def discount_what_is_seen_through(survey: Survey, pairs: list[Ends]) -> None:
-    """Makes looks less promising where one scan sees through the other; a look's pose is rough, so not by much.
+def discount_contradicted(survey: Survey, pairs: list[Ends]) -> None:
+    """Makes looks less promising where the scans' views contradict them; a look's pose is rough, and so is that.
 
     Nothing is changed where even each scan's best look is contradicted: such scans weren't taken from one place.
     """
 
-    def shares(pair: Ends) -> list[float]:
-        promising = [x for x in every(survey.looks[pair]) if x.promise >= PROMISING]
-        return [survey.seen_through([(*pair, x.T_target_source)]) for x in promising]
+    def views(pair: Ends) -> list[visibility.Seen]:
+        return survey.seen((*pair, x.T_target_source) for x in every(survey.looks[pair]) if x.promise >= PROMISING)
 
-    seen = dict(zip(pairs, survey.each("comparing views", shares, pairs), strict=True))
-    telling = visibility.from_one_place(((p, min(found)) for p, found in seen.items()), ROUGHLY_ONE_PLACE)
+    seen = dict(zip(pairs, survey.each("comparing views", views, pairs), strict=True))
+    telling = visibility.from_one_place([(p, x) for p, found in seen.items() for x in found], ROUGHLY_ONE_PLACE)
     for pair, found in seen.items():
         if pair[0] in telling:
-            factors = (1 / (1 + (share / ROUGHLY_CONTRADICTED) ** 2) for share in found)
+            factors = (rough_trust(x) for x in found)
             poses = zip(every(survey.looks[pair]), factors, strict=False)
             survey.looks[pair] = looks.best_of([replace(x, promise=f * x.promise) for x, f in poses])
+
+
+def rough_trust(seen: Seen) -> float:
+    """What views leave of the promise of a rough pose, from 0 to 1."""
+    return float(np.exp(-((seen.contradiction / ROUGHLY) ** 2) / 2))
 
 
 def untried(survey: Survey, start: str, least: float = PROMISING) -> list[Ends]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +14,7 @@ import numpy as np
 
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import reason
+from fmr_cli.multiway.visibility import Seen
 from fmr_cli.registration import Options
 
 Status = Literal["aligned", "uncertain", "failed", "rejected"]
@@ -22,12 +24,15 @@ Status = Literal["aligned", "uncertain", "failed", "rejected"]
 class Hypothesis:
     """A pose that may be right: T_target_source (4, 4) between the centred frames; confidence: that it is.
 
-    seen_through: the share of one scan that the other one sees through there (``visibility``), None until it is known.
+    aligned: ``align`` has called it so, or it was given. firm: it has left no direction open. seen: what the scans'
+    views say of it, None until it is known.
     """
 
     T_target_source: np.ndarray
     confidence: float
-    seen_through: float | None = None
+    aligned: bool = False
+    firm: bool = False
+    seen: Seen | None = None
 
 
 @dataclass
@@ -68,11 +73,11 @@ class Link:
         return self.hypotheses[self.chosen or 0].T_target_source
 
 
-def best_of(first: Link | None, second: Link) -> Link:
-    """One link of two attempts at a pair: the more confident, with the poses that only the other one has."""
+def best_of(first: Link | None, second: Link, worth: Callable[[Link], float]) -> Link:
+    """One link of two attempts at a pair: the one that is worth more, with the poses that only the other one has."""
     if first is None:
         return second
-    a, b = (first, second) if first.confidence >= second.confidence else (second, first)
+    a, b = (first, second) if worth(first) >= worth(second) else (second, first)
     more = [h for h in b.hypotheses if all(apart(h, k, a.edge or b.edge) for k in a.hypotheses)]
     return replace(a, hypotheses=[*a.hypotheses, *more])
 
@@ -117,7 +122,10 @@ class Journal:
         entry = self.known.get(key)
         if entry is None:
             return None
-        poses = [Hypothesis(np.array(T), c) for T, c in entry["hypotheses"]]
+        sure, firm = entry["status"] == "aligned", not entry["message"]
+        poses = [
+            Hypothesis(np.array(T), c, sure and n == 0, firm and n == 0) for n, (T, c) in enumerate(entry["hypotheses"])
+        ]
         return Link(**{**entry, "hypotheses": poses, "information": np.array(entry["information"])})
 
     def keep(self, key: str, link: Link) -> Link:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.files import check_writable
 from fmr_cli.multiway import pose_graph
 from fmr_cli.multiway.adjustment import adjust
-from fmr_cli.multiway.candidates import PORTIONS, look_at_pairs, look_further
+from fmr_cli.multiway.candidates import PORTIONS, look_at_pairs, look_by_planes, look_further
 from fmr_cli.multiway.known import Known
 from fmr_cli.multiway.network import Network
 from fmr_cli.multiway.reading import prepare
@@ -24,6 +25,8 @@ from fmr_cli.multiway.survey import Progress, Survey
 from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration import Options
 from fmr_cli.workers import Workers
+
+LONE = 3  # scans of a component, at most, that are first looked at by planes
 
 
 def align_many(
@@ -59,6 +62,10 @@ def align_many(
             if len(survey.components) > 1 and look_further(survey):
                 join_components(survey)
         confirm(survey)
+        for most in (LONE, math.inf):  # lone scans are few, and often what joins the others
+            if len(survey.components) > 1 and look_by_planes(survey, most):
+                join_components(survey)
+                confirm(survey)
         if try_dear_starts(survey):
             join_components(survey)
             confirm(survey)

@@ -7,11 +7,12 @@ the scan's own centred frame, as GTSAM has it.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from fmr_cli.errors import FmrError
 from fmr_cli.geometry.motion import Motion
@@ -19,6 +20,7 @@ from fmr_cli.geometry.motion import Motion
 EXACT = 1e-9  # sigma, edges and radians, of what is told not to move
 ROBUST = 3.0  # sigmas from which Cauchy's kernel lets a link lose weight
 NARROW, WIDE = 0.02, 10.0  # edges: no link is surer than the first; directions left open get the second
+TINY = 1e-13  # of the normal equations' diagonal, added so that what nothing determines is a large number, not none
 LEVEL = 1e-4  # rad, and edges: how far what ``dof`` forbids may move
 
 
@@ -112,57 +114,53 @@ def optimise(
         measured = gtsam.Pose3(factor.T_target_source)
         graph.add(gtsam.BetweenFactorPose3(factor.target, factor.source, measured, noise))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    try:
-        marginals = gtsam.Marginals(graph, found)
-    except RuntimeError:  # its Cholesky gives up where some links weigh next to nothing beside others
-        marginals = DenseMarginals(graph, found)
     poses = {i: found.atPose3(i).matrix() for i in sorted(T_component_scan)}
-    covariance = {i: marginals.marginalCovariance(i) for i in poses}
-    return Solution(poses, covariance, [without(f, poses, marginals, robust) for f in factors])
+    full = covariance_of(graph.linearize(found).hessian(in_order(poses))[0])
+    place = {i: slice(6 * n, 6 * n + 6) for n, i in enumerate(poses)}
+
+    def joint(i: int, j: int) -> np.ndarray:
+        return np.block([[full[place[a], place[b]] for b in (i, j)] for a in (i, j)])
+
+    covariance = {i: full[place[i], place[i]] for i in poses}
+    return Solution(poses, covariance, [without(f, poses, joint(f.source, f.target), robust) for f in factors])
 
 
-class DenseMarginals:
-    """What ``gtsam.Marginals`` gives, by one dense inverse that copes with entries of very unlike size."""
+def in_order(scans: Iterable[int]) -> Any:
+    """The scans as GTSAM wants an order."""
+    import gtsam
 
-    def __init__(self, graph: Any, values: Any) -> None:
-        import gtsam
-
-        keys = sorted(values.keys())
-        ordering = gtsam.Ordering()
-        for key in keys:
-            ordering.push_back(key)
-        H = graph.linearize(values).hessian(ordering)[0]
-        scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-        self.place = {key: slice(6 * n, 6 * n + 6) for n, key in enumerate(keys)}
-        self.covariance = np.linalg.pinv(H * np.outer(scale, scale), rcond=1e-14, hermitian=True)
-        self.covariance *= np.outer(scale, scale)
-
-    def marginalCovariance(self, i: int) -> np.ndarray:  # noqa: N802 as GTSAM has it
-        return self.at(i, i)
-
-    def jointMarginalCovariance(self, keys: object) -> DenseMarginals:  # noqa: N802
-        return self
-
-    def at(self, i: int, j: int) -> np.ndarray:
-        return np.asarray(self.covariance[self.place[i], self.place[j]])
+    ordering = gtsam.Ordering()
+    for i in scans:
+        ordering.push_back(i)
+    return ordering
 
 
-def without(factor: Factor, poses: dict[int, np.ndarray], marginals: object, robust: bool) -> np.ndarray | None:
+def covariance_of(H: np.ndarray) -> np.ndarray:
+    """The inverse of the normal equations (n, n), in units in which their diagonal is 1.
+
+    Dense: 1,200 unknowns of 200 scans take 0.1 s; and unlike GTSAM's own it copes with links that have lost all but a
+    billionth of their weight beside others that have not.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(H), TINY**2 * np.diag(H).max()))
+    factor = cho_factor(H * np.outer(scale, scale) + TINY * np.eye(len(H)), lower=True)
+    return np.asarray(cho_solve(factor, np.eye(len(H)))) * np.outer(scale, scale)
+
+
+def without(factor: Factor, poses: dict[int, np.ndarray], joint: np.ndarray, robust: bool) -> np.ndarray | None:
     """T_target_source of a factor as the rest of the network has it, from the adjusted network (Baarda's test).
 
-    What the network says is the mean of the factor and the rest, weighted by their information; so the rest is what is
-    left of it without the factor's share. None where the rest says next to nothing.
+    joint: covariance (12, 12) of its source and target. What the network says is the mean of the factor and the rest,
+    weighted by their information; so the rest is what is left of it without the factor's share. None where the rest
+    says next to nothing.
     """
     import gtsam
 
     i, j = factor.source, factor.target
-    joint = marginals.jointMarginalCovariance(gtsam.KeyVector([i, j]))  # type: ignore[attr-defined]
-    both = np.block([[joint.at(i, i), joint.at(i, j)], [joint.at(j, i), joint.at(j, j)]])
     T = np.linalg.inv(poses[j]) @ poses[i]
     A = np.hstack([adjoint(T), -np.eye(6)])  # a twist on the left of T, in the target's frame
     off = gtsam.Pose3.Logmap(gtsam.Pose3(factor.T_target_source @ np.linalg.inv(T)))  # measured, on the left of T
     weight = ROBUST**2 / (ROBUST**2 + off @ factor.information @ off) if robust else 1.0
-    redundancy = np.eye(6) - (A @ both @ A.T) @ (weight * factor.information)
+    redundancy = np.eye(6) - (A @ joint @ A.T) @ (weight * factor.information)
     U, s, Vt = np.linalg.svd(redundancy)
     if s[-1] < 0.05:
         told = s >= 0.05

@@ -19,8 +19,11 @@ from fmr_cli.multiway.looks import best_of as best_look
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.multiway.store import Store
 from fmr_cli.multiway.survey import Survey, ends_of
+from fmr_cli.multiway.visibility import Seen
 from fmr_cli.registration import Options, align
 from fmr_cli.workers.base import LostError, check_there, kept
+
+BELOW_GIVEN = 1 - 1e-9  # confidence of a pose that is found: 1 is for one that is given
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,11 @@ def register(store: Store, task: Attempt) -> Link:
         found = align(a, b, task.options, threads=1, hints=False)
         poses = [(found.T_target_source, found.confidence)]
         poses += [(np.array(x["T_target_source"]), x["confidence"]) for x in found.alternatives]
-        hypotheses = [Hypothesis(enter_frames(T, a.frame, b.frame), float(c)) for T, c in poses]
+        sure, firm = found.status == "aligned", not found.undetermined
+        hypotheses = [
+            Hypothesis(enter_frames(T, a.frame, b.frame), min(float(c), BELOW_GIVEN), sure and n == 0, firm and n == 0)
+            for n, (T, c) in enumerate(poses)
+        ]
         return Link(
             source, target, found.status, start, hypotheses,
             found.information, found.overlap, found.inlier_rmse, found.voxel_size, "; ".join(found.undetermined),
@@ -123,6 +130,7 @@ def register_all(survey: Survey, attempts: list[Attempt]) -> None:
             survey.each("registering", run_errand, [errand(survey, task) for task in new], arrived, handed_out=True)
         else:
             survey.each("registering", partial(register, survey.store), new, arrived)
+    links = []
     for task in attempts:
         link = known[task.key]
         assert link is not None
@@ -132,37 +140,43 @@ def register_all(survey: Survey, attempts: list[Attempt]) -> None:
         kept = [h for h in link.hypotheses if survey.allowed(link.source, link.target, h.T_target_source)]
         if link.hypotheses and not kept:
             link = replace(link, status="uncertain", message="no pose within the known poses and --max-shift")
-        keep(survey, replace(link, hypotheses=kept))
-    judge_views(survey)
+        links.append(flipped(replace(link, hypotheses=kept)))
+    with survey.stage("see through"):
+        judge_views(survey, links)
     with survey.stage("join"):
+        keep(survey, links)
         join(survey)
 
 
-def keep(survey: Survey, link: Link) -> None:
-    """Takes a link in beside what another attempt at its pair has given."""
-    link = flipped(link)
-    survey.links[link.ends] = best_of(survey.links.get(link.ends), link)
+def judge_views(survey: Survey, links: list[Link]) -> None:
+    """What the scans see of each other at each hypothesis."""
+    new = [(link, h) for link in links for h in link.hypotheses]
+    seen = survey.each("comparing views", lambda x: survey.seen([(*x[0].ends, x[1].T_target_source)])[0], new)
+    for (_, h), said in zip(new, seen, strict=True):
+        h.seen = said
 
 
-def judge_views(survey: Survey) -> None:
-    """What one scan sees through of the other at each hypothesis that nobody has looked at yet."""
-    with survey.stage("see through"):
-        new = [(link, h) for link in survey.links.values() for h in link.hypotheses if h.seen_through is None]
-        shares = survey.each(
-            "comparing views", lambda x: survey.seen_through([(*x[0].ends, x[1].T_target_source)]), new
-        )
-        for (_, h), share in zip(new, shares, strict=True):
-            h.seen_through = share
+def keep(survey: Survey, links: list[Link]) -> None:
+    """Takes links in, each beside what another attempt at its pair has given."""
+    scans = consistency.telling([*survey.links.values(), *links])
+
+    def worth(link: Link) -> float:
+        return max((consistency.log_odds(h, link.source in scans) for h in link.hypotheses[:1]), default=-np.inf)
+
+    for link in links:
+        survey.links[link.ends] = best_of(survey.links.get(link.ends), link, worth)
 
 
 def take_known_links(survey: Survey) -> None:
     """Links that are given, and those that are asked for."""
     for source, target, T in survey.given:
         if source in survey.edges and target in survey.edges:
-            pose = Hypothesis(enter_frames(T, survey.frames[source], survey.frames[target]), 1.0, 0.0)
+            pose = Hypothesis(
+                enter_frames(T, survey.frames[source], survey.frames[target]), 1.0, True, True, Seen(0, 0, 0)
+            )
             edge = survey.pair_edge(source, target)
             sure = np.diag([1 / (edge / survey.radius(target)) ** 2] * 3 + [1 / edge**2] * 3)
-            keep(survey, Link(source, target, "aligned", "known", [pose], sure, edge=edge, message="given"))
+            keep(survey, [flipped(Link(source, target, "aligned", "known", [pose], sure, edge=edge, message="given"))])
             survey.never.add(ends_of(source, target))
     attempts = []
     for source, target, rough in survey.asked:
@@ -182,7 +196,7 @@ def join(survey: Survey) -> None:
     given = Component({place[n]: T for n, T in fixed.items()}, {place[n] for n in fixed})
     found, survey.joins = consistency.joined(
         len(order), links, moments, lambda i, j, T: survey.overlap(order[i], order[j], T), given,
-        lambda pairs: survey.seen_through([(order[i], order[j], T) for i, j, T in pairs]),
+        lambda pairs: survey.seen([(order[i], order[j], T) for i, j, T in pairs]),
     )  # fmt: skip
     survey.components = [
         Component({order[k]: T for k, T in c.T_component_scan.items()}, {order[k] for k in c.held}) for c in found

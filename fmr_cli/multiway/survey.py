@@ -77,8 +77,9 @@ class Survey:
         self.described: dict[tuple[int, float], looks.Description] = {}
         self.views: dict[int, visibility.Viewed] = {}
         self.shared: dict[tuple[int, int, bytes], float] = {}  # overlaps that have been worked out already
-        self.through: dict[tuple[int, int, bytes], tuple[int, int]] = {}  # what has been compared already
+        self.compared: dict[tuple[int, int, bytes], visibility.Seen] = {}  # views that have been compared already
         self.looks: dict[Ends, looks.Look] = {}
+        self.looked_by_planes: set[Ends] = set()
         self.alike: dict[int, list[int]] = {}  # by scan, those that resemble it as places and wait for a look
         self.links: dict[Ends, Link] = {}
         self.tried: set[tuple[int, int, str]] = set()
@@ -192,15 +193,15 @@ class Survey:
             self.shared[key] = looks.overlap(a, b, T_target_source)
         return self.shared[key]
 
-    def seen_through(self, pairs: Iterable[tuple[int, int, np.ndarray]]) -> float:
-        """The share of the points of pairs (source, target, pose) that the other scan sees through, all together."""
-        counts = []
+    def seen(self, pairs: Iterable[tuple[int, int, np.ndarray]]) -> list[visibility.Seen]:
+        """What the views of each pair (source, target, pose) say."""
+        found = []
         for source, target, T in pairs:
             key = (source, target, T.tobytes())
-            if key not in self.through:
-                self.through[key] = visibility.contradiction(self.viewed(source), self.viewed(target), T)
-            counts.append(self.through[key])
-        return sum(x for x, _ in counts) / max(sum(said for _, said in counts), 1)
+            if key not in self.compared:
+                self.compared[key] = visibility.compare(self.viewed(source), self.viewed(target), T)
+            found.append(self.compared[key])
+        return found
 
     def motion(self, source: int, target: int, unit: float = 1.0) -> Motion:
         """What may move between two centred frames, lengths in ``unit``."""

@@ -8,12 +8,16 @@ the scan hides another.
 A surface that is seen edge-on says nothing, neither of the viewpoint nor of the other scan: within one cell of a range
 image it reaches from near to far, and a scanner that stands in a doorway sees the wall beside it and what is behind by
 the same ray, but for a centimetre.
+
+A scan sees the near side of what it sees. Two rooms that are put back to back see nothing of each other but a wall that
+coincides, one its near side, the other its far side: what lies close but faces the other way is no agreement either.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -33,12 +37,18 @@ DESCENTS, GENERATIONS, DRAWS, ELITE, MANY = 3, 6, 18, 5, 5_000  # from the best 
 AS_GOOD = (
     0.002  # share of hidden points more than at the best place that leaves a scanner where its file has the origin
 )
-SAMPLE = 4_000  # points that are brought into the other scan's view
+SAMPLE, HASTY = 4_000, 250  # points that are brought into the other scan's view, and where most poses are wrong
 
-# Shares of points that are seen through, on the building of `python -m benchmarks.multiway` with viewpoints found
-# by the scans alone: right poses 0.000 to 0.005, wrong ones that fit well by surfaces and features 0.009 to 0.04.
-CONTRADICTED = 0.008  # takes as much off a pose's log odds as the surest link has; see ``doubt``
-ONE_PLACE = 0.003  # of each scan's best link, in the median: above it, scans were not taken from one place each
+# Shares of points on the building of `python -m benchmarks.multiway`, with viewpoints found by the scans alone. Seen
+# through: right poses 0.000 to 0.0075, wrong ones of rooms that resemble each other 0.009 to 0.06. From behind, of
+# those with a counterpart: right poses at most 0.001, a wall's one side on its other side 0.22 to 0.48, rooms back to
+# back over 0.9. Hidden: 0.004 to 0.04, in the median 0.013; of fragments fused from a moving camera 0.04 to 0.11.
+CONTRADICTED = 0.006  # seen through
+FROM_BEHIND = 0.15  # seen from behind
+OPPOSED = -0.5  # cosine of the normals of two near points, each towards its viewpoint, that are two sides of a thing
+LITTLE = 500  # agreeing points that are added to each count, so that a few points of few contradict nothing
+HIDDEN, NO_PLACE = 0.03, 0.06  # of points, from the best viewpoint: in the median over scans; of any one scan
+ONE_PLACE = 0.4  # contradiction of each best link, in the median: above it, scans were not taken from one place each
 
 _columns = np.maximum((2 * ROWS * np.sin((np.arange(ROWS) + 0.5) / ROWS * np.pi)).astype(int), 1)
 _first = np.concatenate([[0], np.cumsum(_columns)])  # number of each row's first cell
@@ -48,17 +58,54 @@ _first = np.concatenate([[0], np.cumsum(_columns)])  # number of each row's firs
 class Viewed:
     """A scan as seen from where it was taken; centred. edge: of its grid; tree: of all its points.
 
-    some, normals (k, 3): of a few points. viewpoint (3,). nearest, count: range of the nearest point and number of
-    points in each cell of the range image.
+    facing (M, 3): all points' normals, on the viewpoint's side. some, normals (k, 3): of a few points, likewise.
+    viewpoint (3,); hidden: share of points that are hidden from there. nearest, count: range of the nearest point and
+    number of points in each cell of the range image.
     """
 
     edge: float
+    tree: cKDTree
+    facing: np.ndarray
     some: np.ndarray
     normals: np.ndarray
-    tree: cKDTree
     viewpoint: np.ndarray
+    hidden: float
     nearest: np.ndarray
     count: np.ndarray
+
+
+class Seen(NamedTuple):
+    """What scans say of each other at a pose, in points: seen through, seen from behind, agreeing.
+
+    hidden: share of one's own points that are hidden from the place where it seems to have been taken, at most.
+    """
+
+    through: int
+    behind: int
+    agreeing: int
+    hidden: float = 0.0
+
+    @property
+    def seen_through(self) -> float:
+        """From 0; at 1, two scans aren't where they are said to be, whether they are linked or not."""
+        return self.through / (self.through + self.behind + self.agreeing + LITTLE) / CONTRADICTED
+
+    @property
+    def contradiction(self) -> float:
+        """From 0; at 1 a link is contradicted: what it rests on must not be a wall that is seen from two rooms."""
+        return max(self.seen_through, self.behind / (self.behind + self.agreeing + LITTLE) / FROM_BEHIND)
+
+    def __str__(self) -> str:
+        told = max(self.through + self.behind + self.agreeing, 1)
+        if self.behind / FROM_BEHIND > self.through / CONTRADICTED:
+            return f"{self.behind / told:.0%} of what they share there, they see from opposite sides"
+        return f"one scan sees through {self.through / told:.1%} of the other there"
+
+
+def total(seen: Iterable[Seen]) -> Seen:
+    """What many pairs say together."""
+    through, behind, agreeing, hidden = zip(Seen(0, 0, 0), *seen, strict=True)
+    return Seen(sum(through), sum(behind), sum(agreeing), max(hidden))
 
 
 def view(scan: Prepared, edge: float) -> Viewed:
@@ -70,7 +117,15 @@ def view(scan: Prepared, edge: float) -> Viewed:
     points, normals = surface.points[order], surface.normals[order]
     place = viewpoint(points, normals, fine, scan.frame.enter(np.zeros((1, 3)))[0], rng)
     nearest, count = range_image(points - place)
-    return Viewed(fine, points[:SAMPLE], normals[:SAMPLE], surface.tree, place, nearest, count)
+    facing = towards(place, surface.points, surface.normals)
+    some = facing[order[:MANY]]
+    share = hidden((points[:MANY] - place).astype(np.float32), some.astype(np.float32), fine)
+    return Viewed(fine, surface.tree, facing, points[:SAMPLE], some[:SAMPLE], place, share, nearest, count)
+
+
+def towards(place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """The normals (N, 3) of points, each turned to the side that is seen from ``place``."""
+    return np.where(np.einsum("ni,ni->n", place - points, normals)[:, None] < 0, -normals, normals)
 
 
 def viewpoint(
@@ -137,44 +192,65 @@ def cells(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return _first[row] + np.minimum((turn * _columns[row]).astype(int), _columns[row] - 1), distance
 
 
-def contradiction(source: Viewed, target: Viewed, T_target_source: np.ndarray) -> tuple[int, int]:
-    """How many points of either scan the other one sees through at a pose, and how many it says anything about."""
-    one = seen_through(source, target, T_target_source)
-    other = seen_through(target, source, np.linalg.inv(T_target_source))
-    return one[0] + other[0], one[1] + other[1]
+def compare(source: Viewed, target: Viewed, T_target_source: np.ndarray, count: int = SAMPLE) -> Seen:
+    """What two scans say of each other at a pose, by ``count`` points of each; nothing if no viewpoint explains one."""
+    least = max(source.hidden, target.hidden)
+    if least > NO_PLACE:
+        return Seen(0, 0, 0, least)
+    inverse = np.linalg.inv(T_target_source)
+    said = (seen_by(target, source, T_target_source, count), seen_by(source, target, inverse, count))
+    return total(said)._replace(hidden=least)
 
 
-def seen_through(scan: Viewed, by: Viewed, T_by_scan: np.ndarray) -> tuple[int, int]:
-    """How many of a scan's points the other one sees through, and how many it says anything about; they face it."""
-    points = scan.some @ T_by_scan[:3, :3].T + T_by_scan[:3, 3]
-    edge = max(scan.edge, by.edge)
-    near = np.isfinite(by.tree.query(points, distance_upper_bound=NEAR * edge)[0])
-    rays = points - by.viewpoint
+def seen_by(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray, count: int) -> Seen:
+    """What a viewer says of those of a scan's first points whose surface faces it, on either side."""
+    R, t = T_viewer_scan[:3, :3], T_viewer_scan[:3, 3]
+    points, normals = scan.some[:count] @ R.T + t, scan.normals[:count] @ R.T
+    edge = max(scan.edge, viewer.edge)
+    rays = points - viewer.viewpoint
     cell, distance = cells(rays)
-    facing = np.abs(np.einsum("ni,ni->n", rays, scan.normals @ T_by_scan[:3, :3].T)) > FACING * distance
-    through = facing & ~near & (by.count[cell] >= SEEN) & (by.nearest[cell] > distance + APART * edge)
-    return int(through.sum()), int((through | (near & facing)).sum())
+    facing = np.abs(np.einsum("ni,ni->n", rays, normals)) > FACING * distance
+    gap, counterpart = viewer.tree.query(points, distance_upper_bound=NEAR * edge)
+    near = np.isfinite(gap)
+    through = facing & ~near & (viewer.count[cell] >= SEEN) & (viewer.nearest[cell] > distance + APART * edge)
+    met = near & facing
+    opposed = np.einsum("ni,ni->n", normals[met], viewer.facing[counterpart[met]]) < OPPOSED
+    return Seen(int(through.sum()), int(opposed.sum()), int((~opposed).sum()))
 
 
-def from_one_place(shares: Iterable[tuple[tuple[int, int], float]], bound: float) -> set[int]:
-    """The scans that were taken from one place each, so that what they see through tells.
+def beyond(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray) -> float:
+    """The share of a few of a scan's points beyond which a viewer sees: hasty, without a search for counterparts."""
+    rays = scan.some[:HASTY] @ T_viewer_scan[:3, :3].T + (T_viewer_scan[:3, 3] - viewer.viewpoint)
+    cell, distance = cells(rays)
+    past = (viewer.count[cell] >= SEEN) & (viewer.nearest[cell] > distance * (1 + SLANT) + APART * viewer.edge)
+    return float(past.mean())
 
-    shares: of pairs (i, j) that may be linked, what is seen through. Scans that such pairs connect are judged together:
-    each one's least share, in the median, is at most ``bound``; of scans fused from many places it is more.
+
+def from_one_place(found: Iterable[tuple[tuple[int, int], Seen]], bound: float = ONE_PLACE) -> set[int]:
+    """The scans that were taken from one place each, so that their views tell.
+
+    found: of pairs (i, j) that may be linked, what they see. Scans that such pairs connect are judged together: each
+    one's least contradiction, in the median, is at most ``bound``, and so is what is hidden of itself at most HIDDEN;
+    of scans fused from many places it is more.
     """
     least: dict[int, float] = {}
+    hidden: dict[int, float] = {}
     home: dict[int, int] = {}
-    for (i, j), share in shares:
+    for (i, j), seen in found:
         for n in (i, j):
-            least[n] = min(least.get(n, 1.0), share)
+            least[n] = min(least.get(n, np.inf), seen.contradiction)
+            hidden[n] = min(hidden.get(n, np.inf), seen.hidden)
             home.setdefault(n, n)
         a, b = home[i], home[j]
         if a != b:
             home = {n: a if h == b else h for n, h in home.items()}
     groups = [[n for n in home if home[n] == g] for g in sorted(set(home.values()))]
-    return {n for g in groups if np.median([least[k] for k in g]) <= bound for n in g}
+    one_place = (
+        g for g in groups if np.median([least[k] for k in g]) <= bound and np.median([hidden[k] for k in g]) <= HIDDEN
+    )
+    return {n for g in one_place for n in g}
 
 
-def doubt(share: float) -> float:
-    """What a share takes off a pose's log odds: 12 at CONTRADICTED, which no single link outweighs, by its square."""
-    return 12.0 * (share / CONTRADICTED) ** 2
+def doubt(seen: Seen | None) -> float:
+    """What a contradiction takes off a pose's log odds: 12 at 1, which no single link outweighs, by its square."""
+    return 12.0 * seen.contradiction**2 if seen else 0.0

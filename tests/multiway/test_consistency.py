@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.multiway.consistency import joined
 from fmr_cli.multiway.links import Hypothesis, Link
+from fmr_cli.multiway.visibility import Seen
 
 MOMENT = np.diag([1.0, 1.0, 1.0, 1.0])
 EDGE = 0.05
@@ -26,7 +27,8 @@ def link(source: int, target: int, *confidences: float, right: int | None = 0) -
     """Hypotheses of those confidences, of which number ``right`` is true."""
     true = np.linalg.inv(WORLD[target]) @ WORLD[source]
     hypotheses = [
-        Hypothesis(true if k == right else pose(100 * source + 10 * target + k), c) for k, c in enumerate(confidences)
+        Hypothesis(true if k == right else pose(100 * source + 10 * target + k), c, k == 0 and c >= 0.5)
+        for k, c in enumerate(confidences)
     ]
     status = "aligned" if confidences[0] >= 0.5 else "uncertain"
     return Link(source, target, status, "features", hypotheses, np.eye(6), 0.5, 0.01, EDGE)
@@ -100,15 +102,74 @@ def test_what_views_contradict_is_not_joined_but_for_a_link_that_is_given():
 
     def blocked(pairs):
         """Scans 0 and 1 see through 2 and 3."""
-        return 0.1 if any((i < 2) != (j < 2) for i, j, _ in pairs) else 0.0
+        return [Seen(100, 0, 900) if (i < 2) != (j < 2) else Seen(0, 0, 900) for i, j, _ in pairs]
 
     moments = dict.fromkeys(range(4), np.diag([9.0, 9.0, 9.0, 1.0]))
     for x in links:  # views tell, since each scan's best link is in line with them
-        x.hypotheses[0].seen_through = 0.0
-    far = {"seen_through": lambda pairs: 0.0}
-    assert members(joined(4, links, moments, lambda i, j, T: 0.0, **far)[0]) == [[0, 1, 2, 3]]
-    found, apart = joined(4, links, moments, lambda i, j, T: 0.0, seen_through=blocked)
+        x.hypotheses[0].seen = Seen(0, 0, 1000)
+    assert members(joined(4, links, moments, lambda i, j, T: 0.0)[0]) == [[0, 1, 2, 3]]
+    found, apart = joined(4, links, moments, lambda i, j, T: 0.0, seen=blocked)
     assert members(found) == [[0, 1], [2, 3]]
     assert apart[0, 1].denied > 0
     links[2].start = "known"
-    assert members(joined(4, links, moments, lambda i, j, T: 0.0, seen_through=blocked)[0]) == [[0, 1, 2, 3]]
+    assert members(joined(4, links, moments, lambda i, j, T: 0.0, seen=blocked)[0]) == [[0, 1, 2, 3]]
+
+
+def test_a_pose_that_views_forbid_makes_room_for_the_next_best():
+    """Of two poses between the same scans the more confident one brings scans together that contradict each other."""
+    right, wrong = link(2, 0, 0.9), link(3, 1, 0.99, right=None)
+    links = [link(1, 0, 0.99), link(3, 2, 0.99), right, wrong]
+    for x in links:
+        x.hypotheses[0].seen = Seen(0, 0, 1000)
+
+    def views(pairs):
+        """Contradiction wherever scans 0 and 2 are not where they belong."""
+        found = []
+        for i, j, T in pairs:
+            at_home = np.allclose(T, np.linalg.inv(WORLD[j]) @ WORLD[i], atol=1e-6)
+            found.append(Seen(0, 0, 900) if at_home else Seen(100, 0, 900))
+        return found
+
+    moments = dict.fromkeys(range(4), np.diag([99.0, 99.0, 99.0, 1.0]))
+    found, _ = joined(4, links, moments, lambda i, j, T: 0.0, seen=views)
+    assert members(found) == [[0, 1, 2, 3]]
+    T = found[0].T_component_scan
+    assert np.allclose(np.linalg.inv(T[0]) @ T[2], np.linalg.inv(WORLD[0]) @ WORLD[2], atol=1e-6)
+
+
+def test_where_rooms_resemble_each_other_doubtful_links_that_agree_join_nothing():
+    """As many of the sure poses are ruled out by views as in a building of like rooms: agreement says little there."""
+
+    def doubtful(ruled_out):
+        links = [link(1, 0, 0.99), link(3, 2, 0.99), link(2, 0, 0.3), link(3, 1, 0.3)]
+        alike = [link(5, n, 0.99, right=None) for n in range(4)] + [link(4, n, 0.99, right=None) for n in range(4)]
+        for x, agreeing in zip(
+            links, (1000, 1000, 0, 0), strict=True
+        ):  # of the doubtful ones views have nothing to say
+            x.hypotheses[0].seen = Seen(0, 0, agreeing)
+        for x in alike:
+            x.hypotheses[0].seen = Seen(100, 0, 1000) if ruled_out else Seen(0, 0, 1000)
+        for n in range(2):  # so that views tell of 4 and 5, too
+            links.append(link(4 + n, n, 0.02))
+            links[-1].hypotheses[0].seen = Seen(0, 0, 1000)
+            links[-1].hypotheses[0].aligned = True
+        return joined(6, links if not ruled_out else [*links, *alike], dict.fromkeys(range(6), MOMENT), lambda *_: 0.0)
+
+    assert any({0, 1, 2, 3} <= set(scans) for scans in members(doubtful(False)[0]))
+    assert not any({0, 2} <= set(scans) for scans in members(doubtful(True)[0]))
+
+
+def test_views_confirm_a_link_that_align_is_shy_of_unless_it_leaves_a_direction_open():
+    def found(firm: bool, seen: Seen):
+        links = [link(1, 0, 0.99), link(3, 2, 0.99), link(2, 0, 0.05)]
+        for x in links[:2]:
+            x.hypotheses[0].seen = Seen(0, 0, 1000)
+        links[2].hypotheses[0].seen, links[2].hypotheses[0].firm = seen, firm
+        return members(components(4, links)[0])
+
+    assert found(True, Seen(0, 0, 1000)) == [[0, 1, 2, 3]]
+    assert found(False, Seen(0, 0, 1000)) == [[0, 1], [2, 3]]
+    assert found(True, Seen(0, 0, 300)) == [[0, 1], [2, 3]], "too few points to say so"
+    assert found(True, Seen(8, 0, 1000)) == [[0, 1], [2, 3]], "something is seen through"
+    assert found(True, Seen(0, 400, 1000)) == [[0, 1], [2, 3]], "a wall from its two sides"
+    assert found(True, Seen(0, 0, 0, hidden=0.2)) == [[0, 1], [2, 3]], "no viewpoint explains one of the scans"
