@@ -83,7 +83,11 @@ class DaskWorkers:
         if isinstance(self.address, distributed.Client):
             self.client = self.address
         elif self.address == "local":
-            with deaf_to_interrupts():  # Ctrl-C ends this process, which ends the workers
+            import dask
+
+            # Nobody looks at the profile that each worker takes a hundred times a second
+            unwatched = dask.config.set({"distributed.worker.profile.enabled": False})
+            with unwatched, deaf_to_interrupts():  # Ctrl-C ends this process, which ends the workers
                 self.cluster = distributed.LocalCluster(
                     n_workers=self.wanted or usable_cores(), threads_per_worker=1,
                     dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
