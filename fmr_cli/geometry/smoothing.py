@@ -29,7 +29,19 @@ def local_planes(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[np
     return points - off[:, None] * normals, normals, deviation / np.maximum(distance[:, -1], 1e-300)
 
 
-def roughness(points: np.ndarray) -> float:
-    """The median roughness of small neighbourhoods of points (N, 3), by ``local_planes``: 0.05 is clean, 0.2 noisy."""
+def roughness(points: np.ndarray, wide: int) -> tuple[float, float]:
+    """How rough small neighbourhoods of points (N, 3) are, and whether that is noise: medians over some of them.
+
+    The roughness by ``local_planes``: 0.05 is clean, 0.2 noisy, or so sparse that 10 neighbours show the shape. And by
+    what factor the deviation grows from these to ``wide`` neighbours: noise is as large over any neighbourhood (up to
+    the root of the numbers' ratio, where it is larger than the neighbourhoods), while at a crease the deviation grows
+    as their radius, on a bend as its square.
+    """
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-    return float(np.median(local_planes(points[:: max(len(points) // PROBES, 1)], tree, NEAR)[2]))
+    some = points[:: max(len(points) // PROBES, 1)]
+    near = local_planes(some, tree, NEAR)[2]
+    if wide >= tree.n:
+        return float(np.median(near)), np.inf
+    far = local_planes(some, tree, wide)[2]
+    radii = [tree.query(some, [count])[0][:, 0] for count in (NEAR, wide)]
+    return float(np.median(near)), float(np.median(far * radii[1] / np.maximum(near * radii[0], 1e-300)))

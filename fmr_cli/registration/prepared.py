@@ -108,9 +108,9 @@ class Prepared:
 
         return self._fine.get((count, edge), thin)
 
-    def roughness(self, count: int, edge: float) -> float:
-        """Of ``fine``: about 0.05 on clean scans, from 0.1 on the points are noisy (see ``smoothing``)."""
-        return self._roughness.get((count, edge), lambda: roughness(self.fine(count, edge)))
+    def roughness(self, count: int, edge: float, wide: int) -> tuple[float, float]:
+        """Of ``fine``: about 0.05 on clean scans, from 0.1 on noisy ones or sparse, and its growth (``smoothing``)."""
+        return self._roughness.get((count, edge), lambda: roughness(self.fine(count, edge), wide))
 
     def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> GicpCloud:
         """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""

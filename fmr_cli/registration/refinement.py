@@ -16,7 +16,7 @@ from fmr_cli.geometry.planar import within_plane
 from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_plane, step_motion, with_scale
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.se3 import exp
-from fmr_cli.geometry.smoothing import local_planes
+from fmr_cli.geometry.smoothing import NEAR, local_planes
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.pair import RANKING_POINTS, Pair
@@ -32,6 +32,7 @@ DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determin
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
 # Tried on RedKitchen scans, by hand: roughness 0.22 at 1 % noise, below 0.08 without; 30 neighbours best of 10 to 50.
 ROUGH, SMOOTHED_OVER = 0.12, 30
+NOISE_GROWTH = (SMOOTHED_OVER / NEAR) ** 0.5  # of the deviation from the small planes to the wide ones, at most
 SMOOTHED_REACHES = (1.0, 1.0, 0.7, 0.7, 0.5, 0.5)  # voxel edges, a step each
 GICP_REACH = 3.0  # voxel edges: source points further from the target slow its k-d tree down, by up to 500 times
 EXACT_TARGET = 200_000  # points of the target that the winner is refined against once more, each its own
@@ -128,9 +129,14 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
 
 
 def noisy(pair: Pair) -> bool:
-    """Whether the points of a cloud scatter about its surface by more than GICP's small neighbourhoods even out."""
+    """Whether the points of a cloud scatter about its surface by more than GICP's small neighbourhoods even out.
+
+    Not where they are so sparse that their neighbourhoods show its shape: wider ones would cut its corners.
+    """
     clouds = ((pair.source, GICP_SOURCE), (pair.target, GICP_TARGET))
-    return max(cloud.roughness(count, pair.edge) for cloud, count in clouds) > ROUGH
+    found = [cloud.roughness(count, pair.edge, SMOOTHED_OVER) for cloud, count in clouds]
+    rough = [growth for roughness, growth in found if roughness > ROUGH]
+    return bool(rough) and max(rough) < NOISE_GROWTH
 
 
 def by_smoothed(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:

@@ -15,8 +15,16 @@ def ball(noise: float) -> np.ndarray:
 
 
 def test_noise_is_rough_and_a_curved_surface_is_not() -> None:
-    assert roughness(ball(0.0)) < 0.05
-    assert roughness(ball(0.05)) > 0.15
+    assert roughness(ball(0.0), 30)[0] < 0.05
+    assert roughness(ball(0.05), 30)[0] > 0.15
+
+
+def test_noise_does_not_grow_with_the_neighbourhood_and_shape_does() -> None:
+    assert roughness(ball(0.05), 30)[1] < 3**0.5
+    rough, growth = roughness(ball(0.0)[:150], 30)  # so sparse that ten neighbours see the bend
+    assert rough > 0.05
+    assert growth > 2
+    assert roughness(ball(0.0)[:20], 30)[1] == np.inf
 
 
 def test_points_come_nearer_to_the_surface() -> None:
