@@ -13,12 +13,13 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 if TYPE_CHECKING:
+    from fmr_cli.feature_metric.numpy_solver import NumpySolver
     from fmr_cli.registration.prepared import Prepared
 
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
-POINTS_PER_VOXEL = 4  # of a scan that has few points, on average: finer voxels would hold no surface
+POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold no surface
 NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice ...
 MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that these are mostly points of one ring
 # A neighbourhood is a line where its second principal variance is less than so much of the first: any normal across it
@@ -60,6 +61,7 @@ class PreparedScan:
         rays = self.points - sensor
         self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
         self.ranges = np.linalg.norm(rays, axis=1)
+        self._feature: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -90,13 +92,12 @@ class PreparedScan:
         centre = self.few.mean(0)
         return centre, float(np.linalg.norm(self.few - centre, axis=1).max())
 
-    @cached_property
-    def feature(self) -> np.ndarray:
-        """(d,), the global feature of the few points in their box."""
-        from fmr_cli.registration.models import fast_encoder
-
-        centre, unit = self.box
-        return fast_encoder()(((self.few - centre) / unit).astype(np.float32))
+    def feature(self, encode: NumpySolver) -> np.ndarray:
+        """(d,), the global feature of the few points in their box; worked out once, by the sequence's one encoder."""
+        if self._feature is None:
+            centre, unit = self.box
+            self._feature = encode(((self.few - centre) / unit).astype(np.float32))
+        return self._feature
 
     @cached_property
     def for_align(self) -> Prepared:

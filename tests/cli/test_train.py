@@ -93,6 +93,7 @@ def test_scans_teach_all_that_registration_uses(tmp_path, fmr_here, samples):
     for command in (
         ("align", "scans/scan_a.ply", "scans/scan_b.ply"),
         ("multiway", "scans/scan_a.ply", "scans/scan_b.ply", "--out", "net"),
+        ("sequence", "scans", "--out", "poses.txt"),
     ):
         used = fmr_here(*command, "--model", "runs/train/model.safetensors", cwd=tmp_path)
         assert used.returncode == 0, used.stderr
