@@ -248,15 +248,24 @@ class Odometry:
     def _observed_elsewhere(self, scan: PreparedScan, fit: Fit, expected: Expected, slope: float) -> Fit | None:
         """A pose found from further off that fits about as well and leaves nothing open.
 
-        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing.
+        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing. The first
+        motion of all may be further than any level of the map reaches: there the scan before is asked.
         """
-        other = self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)
-        if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
-            return None
-        if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
-            return None
-        other, _ = self.map.polish(scan, other, slope)
-        return other if other.seen is not None and other.seen.observed.all() else None
+        assert self.motion
+        others = [self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)]
+        if not self.motion.begun and not expected.told:
+            found, T_map_features = self._by_features(scan)
+            if found.status == "aligned":
+                others.append(self.map.fit(scan, T_map_features, (COARSE, FINE), "features"))
+        for other in others:
+            if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
+                continue
+            if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
+                continue
+            other, _ = self.map.polish(scan, other, slope)
+            if other.seen is not None and other.seen.observed.all():
+                return other
+        return None
 
     def _found_from_both_sides(self, scan: PreparedScan, held: Fit, slope: float) -> Fit | None:
         """The one pose to which starts ASIDE of the prediction along every unobserved direction come back.
