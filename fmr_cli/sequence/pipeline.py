@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
@@ -37,6 +37,8 @@ from fmr_cli.sequence.priors import Priors
 from fmr_cli.sequence.result import SequenceResult
 from fmr_cli.sequence.scans import Scans, as_scans
 from fmr_cli.sequence.voxel_frame import VoxelFrame
+
+VOXEL_SCANS = 5  # that the working voxel follows from: a first scan may stand in a narrow place, or before a wall
 
 OnRow = Callable[[dict[str, Any], int, int], None]
 
@@ -153,8 +155,15 @@ def begin(scans: Scans, options: SequenceOptions, known_map: PointCloud | None) 
         scan_times(cloud)  # says before anything is written that points have no times
     origin = np.median(cloud.points, axis=0)
     map_origin = np.median(known_map.points, axis=0) if known_map else origin
-    frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size), origin, map_origin)
+    frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size, some_later(scans)), origin, map_origin)
     return Beginning(frame, first_motion(scans, frame, options) if options.deskew else np.eye(4))
+
+
+def some_later(scans: Scans) -> Iterator[np.ndarray]:
+    """The points (N, 3) of a few scans over the whole sequence; those that cannot be read are bridged later on."""
+    for index in sorted({len(scans) * part // VOXEL_SCANS for part in range(1, VOXEL_SCANS)} - {0}):
+        with suppress(CloudFileError):
+            yield scans.read(index, attributes=False).points
 
 
 def first_motion(scans: Scans, frame: VoxelFrame, options: SequenceOptions) -> np.ndarray:

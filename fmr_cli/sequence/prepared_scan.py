@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,7 +21,10 @@ if TYPE_CHECKING:
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
-POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold no surface
+POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold noise
+# Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
+# they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
+HELD = 2.2
 NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice ...
 MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that these are mostly points of one ring
 # A neighbourhood is a line where its second principal variance is less than so much of the first: any normal across it
@@ -129,22 +134,41 @@ def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
     return scan if len(scan) >= MIN_POINTS else None
 
 
-def choose_voxel(points: np.ndarray, wish: float | None = None) -> float:
-    """The voxel edge that thins points (N, 3) to WORKING_POINTS, or to a quarter of them where they are few.
+def choose_voxel(points: np.ndarray, wish: float | None = None, others: Iterable[np.ndarray] = ()) -> float:
+    """The voxel edge that suits a sequence whose first scan has points (N, 3), to two digits, in their unit.
 
-    In the points' unit, to two digits. wish: an edge to be near to, within HINT. Raises RegistrationError where all
-    points are in one place.
+    others: some of the later scans, (N, 3) each; the median of what suits each of them counts. wish: an edge to be near
+    to, within HINT. Raises RegistrationError where the first scan's points are too few or all in one place.
+    """
+    edges = [suitable_voxel(points)]
+    for other in others:
+        with suppress(RegistrationError):
+            edges.append(suitable_voxel(other))
+    voxel = float(np.median(edges))
+    return float(f"{voxel:.2g}" if wish is None else np.clip(wish, voxel / HINT, voxel * HINT))
+
+
+def suitable_voxel(points: np.ndarray) -> float:
+    """The finest edge that leaves WORKING_POINTS of the points (N, 3) at most, POINTS_PER_VOXEL in each on average, and
+    voxels that hold a surface (``HELD``). Raises RegistrationError.
     """
     wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
     if not spread > 0 or wanted < MIN_POINTS:
         raise RegistrationError("too few points, or all in one place")
-    voxel, centre = spread / 20, np.median(points, axis=0)
+    voxel, centred = spread / 20, points - np.median(points, axis=0)
     for _ in range(STEPS):
-        count = small_gicp.voxelgrid_sampling((points - centre) / voxel, 1.0).size()
+        count = small_gicp.voxelgrid_sampling(centred / voxel, 1.0).size()
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
-    if wish is not None:
-        return float(np.clip(wish, voxel / HINT, voxel * HINT))
-    return float(f"{voxel:.2g}")
+    for _ in range(STEPS):
+        thinned = small_gicp.voxelgrid_sampling(centred / voxel, 1.0)
+        if thinned.size() <= NEIGHBOURS:
+            break
+        squared = small_gicp.KdTree(thinned).batch_knn_search(thinned.points()[:, :3], NEIGHBOURS)[1]
+        apart = float(np.sqrt(np.median(np.array(squared)[:, -1])))
+        if apart <= HELD:
+            break
+        voxel *= apart / HELD
+    return float(voxel)
