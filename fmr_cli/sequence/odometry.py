@@ -249,11 +249,11 @@ class Odometry:
         """A pose found from further off that fits about as well and leaves nothing open.
 
         A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing. The first
-        motion of all may be further than any level of the map reaches: there the scan before is asked.
+        motion of all, or one after a gap, may be further than any level of the map reaches: where the fit is not as
+        good as usual, the scan before is asked.
         """
-        assert self.motion
         others = [self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)]
-        if not self.motion.begun and not expected.told:
+        if not expected.told and not (self.usual and self._usual(fit)):
             found, T_map_features = self._by_features(scan)
             if found.status == "aligned":
                 others.append(self.map.fit(scan, T_map_features, (COARSE, FINE), "features"))

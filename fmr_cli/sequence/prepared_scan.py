@@ -25,6 +25,8 @@ POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels 
 # Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
 # they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
 HELD = 2.2
+NOISE = 0.06  # edges, of the scatter about planes: normals of ten points in finer voxels are mostly noise
+GRAIN_EVERY = 3  # points, of which one is asked about its neighbours
 NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice ...
 MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that these are mostly points of one ring
 # A neighbourhood is a line where its second principal variance is less than so much of the first: any normal across it
@@ -150,7 +152,7 @@ def choose_voxel(points: np.ndarray, wish: float | None = None, others: Iterable
 
 def suitable_voxel(points: np.ndarray) -> float:
     """The finest edge that leaves WORKING_POINTS of the points (N, 3) at most, POINTS_PER_VOXEL in each on average, and
-    voxels that hold a surface (``HELD``). Raises RegistrationError.
+    voxels that hold a surface (HELD) rather than noise (NOISE). Raises RegistrationError.
     """
     wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
@@ -163,12 +165,24 @@ def suitable_voxel(points: np.ndarray) -> float:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
     for _ in range(STEPS):
-        thinned = small_gicp.voxelgrid_sampling(centred / voxel, 1.0)
-        if thinned.size() <= NEIGHBOURS:
+        apart, noise = grain(centred / voxel)
+        if apart <= HELD and noise <= NOISE:
             break
-        squared = small_gicp.KdTree(thinned).batch_knn_search(thinned.points()[:, :3], NEIGHBOURS)[1]
-        apart = float(np.sqrt(np.median(np.array(squared)[:, -1])))
-        if apart <= HELD:
-            break
-        voxel *= apart / HELD
+        voxel *= max(apart / HELD, noise / NOISE)
     return float(voxel)
+
+
+def grain(points: np.ndarray) -> tuple[float, float]:
+    """Of points (N, 3) in voxels, thinned to one a voxel: the median distance to the tenth neighbour, and how far the
+    flattest quarter of the neighbourhoods strays from its planes (standard deviation), lines left out.
+    """
+    thinned = small_gicp.voxelgrid_sampling(points, 1.0)
+    if thinned.size() <= NEIGHBOURS:
+        return 0.0, 0.0
+    points = thinned.points()[:, :3]
+    index, squared = small_gicp.KdTree(thinned).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
+    near = points[index.astype(np.int64)]
+    arm = near - near.mean(1, keepdims=True)
+    values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", arm, arm) / NEIGHBOURS)
+    flat = np.maximum(values[values[:, 1] > LINE * values[:, 2], 0], 0)
+    return float(np.sqrt(np.median(squared[:, -1]))), float(np.sqrt(np.quantile(flat, 0.25))) if len(flat) else 0.0
