@@ -26,6 +26,7 @@ POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels 
 # they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
 HELD = 2.2
 NOISE = 0.06  # edges, of the scatter about planes: normals of ten points in finer voxels are mostly noise
+COARSER = 2.5  # times the edge that the count gives, at most: what still strays is curved, or clutter
 GRAIN_EVERY = 3  # points, of which one is asked about its neighbours
 NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice ...
 MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that these are mostly points of one ring
@@ -164,11 +165,12 @@ def suitable_voxel(points: np.ndarray) -> float:
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
+    largest = COARSER * voxel
     for _ in range(STEPS):
         apart, noise = grain(centred / voxel)
-        if apart <= HELD and noise <= NOISE:
+        if voxel >= largest or (apart <= HELD and noise <= NOISE):
             break
-        voxel *= max(apart / HELD, noise / NOISE)
+        voxel = min(voxel * max(apart / HELD, noise / NOISE), largest)
     return float(voxel)
 
 

@@ -32,15 +32,15 @@ def test_few_points_have_at_least_two_in_a_voxel():
 
 
 def test_noise_asks_for_larger_voxels():
-    clean, noisy = (floor(np.random.default_rng(0), 40_000, noise) for noise in (0.005, 0.2))
-    assert suitable_voxel(clean) < 0.3
-    assert suitable_voxel(noisy) > 5 * 0.2  # the flattest neighbourhoods stray by less than the noise itself
+    clean, noisy, wild = (suitable_voxel(floor(np.random.default_rng(0), 40_000, noise)) for noise in (0.0, 0.05, 1.0))
+    assert 1.5 * clean < noisy
+    assert wild < 10 * clean  # what only strays, at any edge, does not end in a handful of voxels
 
 
 def test_between_lines_far_apart_voxels_are_not_left_empty():
     edge = suitable_voxel(rings(1.0))
     assert (
-        edge > 0.4
+        edge > 0.05
     )  # ten neighbours on one line reach 5 voxels either way, at the edge that leaves 12,000 points 0.03
 
 
