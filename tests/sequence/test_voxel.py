@@ -39,9 +39,7 @@ def test_noise_asks_for_larger_voxels():
 
 def test_between_lines_far_apart_voxels_are_not_left_empty():
     edge = suitable_voxel(rings(1.0))
-    assert (
-        edge > 0.05
-    )  # ten neighbours on one line reach 5 voxels either way, at the edge that leaves 12,000 points 0.03
+    assert edge > 0.05  # at the edge of the count alone, 0.03, ten neighbours are all of one line
 
 
 def test_later_scans_count_and_those_that_cannot_be_used_do_not():
