@@ -1,27 +1,34 @@
 # make demo: environment, install, and two sample scans registered. make test: lint, types and tests, and what was skipped.
-# make docs: the documentation, into site/; a broken link fails it.
+# make test-all: the slow tests too, as CI runs them. make docs: the documentation, into site/; a broken link fails it.
 # All make .venv from nothing but Python 3.11 or later (on Debian: apt install python3-venv); again, they are quick.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
 WORKERS ?= auto # of pytest; a test process takes about 0.7 GB
 
-.PHONY: demo test coverage docs clean
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal # runs of tests: what a file's tests share is made once
+
+.PHONY: demo lint test test-all coverage docs clean
 
 demo: .venv/installed
 	mkdir -p demo
 	$(BIN)/fmr align samples/scan_a.ply samples/scan_b.ply -o demo/T.txt --merged demo/merged.ply --metrics demo/metrics.json
 	cat demo/T.txt
 
-test: .venv/installed-for-tests
+lint: .venv/installed-for-tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS)
+
+test: lint
+	$(PYTEST) -m "not slow"
+
+test-all: lint
+	$(PYTEST)
 
 coverage: .venv/installed-for-tests
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --cov --cov-report=term-missing:skip-covered
+	$(PYTEST) --cov --cov-report=term-missing:skip-covered
 
 docs: .venv/installed-for-docs
 	$(BIN)/mkdocs build --strict

@@ -11,12 +11,33 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from fmr_cli.evaluation.verdict_evidence import gather
+import numpy as np
+
+from fmr_cli.evaluation.verdict_evidence import Judged, gather
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit
-from fmr_cli.report.calibration import calibration_table, plot_calibration
+from fmr_cli.registration.confidence import BARE, CONTRADICTION, DETAIL, OTHER_SCALE, STRETCH, detail_log, standing
+from fmr_cli.report.calibration import calibration_error, calibration_table, plot_calibration
+
+
+def bounds_in(evidence: Sequence[Judged]) -> list[str]:
+    """How often right poses have what bounds the confidence whatever the weights say, see ``confidence.most``."""
+    weights = fit(evidence)
+    first = [int(standing(j.x, weights)[0].argmax()) for j in evidence]
+    x, right = zip(*((j.x[i], j.right[i]) for j, i in zip(evidence, first, strict=True)), strict=True)
+    seen, good = np.array(x), np.array(right)
+    poses = np.concatenate([j.x[j.right] for j in evidence])
+    stretched = -poses[:, STRETCH] > 100 * OTHER_SCALE
+    said = [f"fits better by another scale: {stretched.sum()} of {len(poses)} right poses"]
+    for name, holds in (
+        ("more contradicted than explained", seen[:, CONTRADICTION] < 0),
+        ("hardly more than three planes", seen[:, DETAIL] < detail_log(BARE)),
+    ):
+        said.append(f"{name}: {good[holds].sum()} of {holds.sum()} poses that stood first were right")
+    return said
 
 
 def main() -> None:
@@ -31,6 +52,9 @@ def main() -> None:
     confidence, right = cross_validated(evidence)
     print(f"{len(evidence)} looks at {args.pairs} pairs, each judged by weights fitted on others:")
     print(calibration_table(confidence, right))
+    print(f"expected calibration error {calibration_error(confidence, right):.3f}")
+    for line in bounds_in(evidence):
+        print(line)
     made = {"made by": f"python -m benchmarks.calibrate --pairs {args.pairs} --seed {args.seed}"}
     weights = {name: [float(f"{v:.6g}") for v in values] for name, values in asdict(fit(evidence)).items()}
     (args.out / "verdict.json").write_text(json.dumps(made | weights, indent=1) + "\n")

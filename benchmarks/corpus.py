@@ -18,6 +18,9 @@ import laspy
 import lzf
 import numpy as np
 
+from benchmarks.bag_files import OUSTER, write_bag
+from benchmarks.bag_files import records as bag_records
+from benchmarks.copc_file import write_copc
 from fmr_cli.cloud import PointCloud
 from fmr_cli.io import write_cloud
 
@@ -327,6 +330,24 @@ def las_examples() -> list[Example]:
             path = Path(folder) / "a.e57"
             write_cloud(path, cloud)
             found.append(Example("E57", path.name, path.read_bytes(), ("intensity", *COLORS)))
+    return found
+
+
+def parted_examples() -> list[Example]:
+    """COPC and bags, whose points come in another order or as several scans: the fuzzer starts from them too."""
+    found = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_copc(folder / "a.copc.laz", P, levels=2, root=20)
+        found.append(Example("COPC", "a.copc.laz", (folder / "a.copc.laz").read_bytes()))
+        if find_spec("rosbags"):
+            scan = bag_records(OUSTER, P.astype(np.float32))
+            for kind in ("a.bag", "a.mcap"):
+                path = write_bag(folder / kind, {"/lidar": [scan, scan]})
+                found.append(Example("ROS 1 bag, ROS 2 bag, MCAP", kind, path.read_bytes()))
+            write_bag(folder / "ros2", {"/lidar": [scan, scan]})
+            database = next((folder / "ros2").glob("*.db3"))
+            found.append(Example("ROS 1 bag, ROS 2 bag, MCAP", "a.db3", database.read_bytes()))
     return found
 
 

@@ -16,7 +16,7 @@ from fmr_cli.cli.app import app
 from fmr_cli.evaluation.quoted import QUOTED
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "docs" / "results" / "paper.csv"
+RESULTS = [ROOT / "docs" / "results" / name for name in ("paper.csv", "last-step.csv")]
 MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
@@ -117,16 +117,29 @@ def quoted(dataset: str) -> str:
 
 
 def experiment(name: str) -> str:
-    """One of the paper's experiments, from the results.csv of `fmr evaluate` beside the page: methods by level."""
-    with RESULTS.open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["experiment"] == name]
-    levels = list(dict.fromkeys(row["level"] for row in rows))
+    """One experiment, from the results.csv of `fmr evaluate` beside the page: methods, of each set, by level."""
+    rows = []
+    for path in RESULTS:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows += [row for row in csv.DictReader(file) if row["experiment"] == name]
+    levels, several = list(dict.fromkeys(row["level"] for row in rows)), len({row["clouds"] for row in rows}) > 1
     lines = [f"| | {' | '.join(f'{float(level):g}' for level in levels)} |", "| --- " * (len(levels) + 1) + "|"]
-    for method in dict.fromkeys(row["method"] for row in rows):
-        own = {row["level"]: row for row in rows if row["method"] == method}
-        cells = [f"{float(own[x]['success']):.2f} ({float(own[x]['rotation_mean']):.1f})" for x in levels]
-        lines.append(f"| {method} | {' | '.join(cells)} |")
+    for clouds, method in dict.fromkeys((row["clouds"], row["method"]) for row in rows):
+        own = {row["level"]: row for row in rows if (row["clouds"], row["method"]) == (clouds, method)}
+        said = f"{method}, {clouds}" if several else method
+        lines.append(f"| {said} | {' | '.join(cell(own[x]) for x in levels)} |")
     return "\n".join(lines)
+
+
+def cell(row: dict[str, str]) -> str:
+    """What the page shows of a row: a share and an error, or the error and how many times the limit it is."""
+    if row.get("aligned_right"):
+        shares = f"{float(row['aligned_right']):.2f} / {float(row['aligned_wrong']):.2f}"
+        return f"{float(row['success']):.2f} ({shares}; {100 * float(row['scale_median']):.2g} %)"
+    if row["experiment"].startswith("refine"):
+        times = f" ({float(row['limit_ratio']):.1f})" if row["limit_ratio"] else ""
+        return f"{float(row['rotation_median']):.3f}{times}"
+    return f"{float(row['success']):.2f} ({float(row['rotation_mean']):.1f})"
 
 
 def calibration() -> str:

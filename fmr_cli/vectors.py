@@ -13,7 +13,8 @@ import numpy as np
 
 # The name without its x, y or z, in small letters without _ - . and blanks -> what a transform does to it
 DIRECTIONS = ("n", "nor", "norm", "normal", "normals", "pointnormal", "vertexnormal", "dir", "direction",
-              "ray", "raydir", "raydirection", "beam", "beamdirection", "scandirection", "viewdirection",
+              "ray", "raydir", "raydirection", "beam", "beamdir", "beamdirection", "scandir", "scandirection",
+              "viewdir", "viewdirection", "lineofsight",
               "tangent", "axis")  # fmt: skip
 # t: the LAS waveform's direction, coordinates per picosecond. d: scan direction or flow; both turn
 DISPLACEMENTS = ("v", "vel", "velocity", "velocities", "speed", "flow", "sceneflow", "motion", "displacement", "d",
@@ -54,7 +55,7 @@ def find_vectors(attributes: Mapping[str, np.ndarray]) -> list[Vector]:
     return found
 
 
-def spellings(name: str, rest: re.Match) -> Iterable[tuple[str, ...]]:
+def spellings(name: str, rest: re.Match[str]) -> Iterable[tuple[str, ...]]:
     """The triples that a name may begin: x at its start or end, or 0 at its end."""
     if rest[1]:
         yield tuple(letter + rest[1] for letter in ("xyz" if name[0] == "x" else "XYZ"))
@@ -154,8 +155,10 @@ def turned_harmonics(count: int, R: np.ndarray) -> np.ndarray:
 
 
 def basis(d: np.ndarray) -> np.ndarray:
-    """Real spherical harmonics of degree 1 to 3 at unit vectors (N, 3) -> (N, 15), order and signs of 3D Gaussian
-    Splatting (Kerbl et al. 2023); constant factors of a whole degree are left out, they cancel.
+    """Real spherical harmonics of degree 1 to 3 at unit vectors: (N, 3) -> (N, 15).
+
+    Order and signs of 3D Gaussian Splatting (Kerbl et al. 2023); constant factors of a whole degree are left out, they
+    cancel.
     """
     x, y, z = d.T
     xx, yy, zz = x * x, y * y, z * z

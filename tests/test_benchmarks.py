@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import json
-import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -23,10 +26,11 @@ ROOT = Path(__file__).parents[1]
 
 
 def run(module: str, *arguments: str) -> str:
-    command = [sys.executable, "-m", module, *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    """What ``python -m MODULE ARGUMENTS`` prints, run here: to start a process with torch takes seconds."""
+    out = io.StringIO()
+    with mock.patch.object(sys, "argv", [module, *arguments]), contextlib.chdir(ROOT), contextlib.redirect_stdout(out):
+        importlib.import_module(module).main()
+    return out.getvalue()
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -80,6 +84,7 @@ def test_speed_writes_a_report_and_a_plot(tmp_path: Path) -> None:
     assert (tmp_path / "speed.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_accuracy_of_a_folder(tmp_path: Path) -> None:
     for number, cloud in enumerate(room_clouds(2, 1500, 1)):
         write_cloud(tmp_path / f"{number}.ply", PointCloud(cloud))
@@ -91,12 +96,14 @@ def test_accuracy_of_a_folder(tmp_path: Path) -> None:
     assert rows[0]["recall"] == 1.0
 
 
+@pytest.mark.slow
 def test_the_card_of_the_encoder_can_be_measured_again() -> None:
     said = run("benchmarks.encoders", "models/base.safetensors", "--pairs", "1")
     for clouds in ("shapes", "others", "rooms"):
         assert clouds in said
 
 
+@pytest.mark.slow
 def test_calibrate_writes_weights_in_the_form_of_the_bundled_ones(tmp_path: Path) -> None:
     said = run("benchmarks.calibrate", "--pairs", "8", "--workers", "1", "--out", str(tmp_path))
     assert "looks at 8 pairs" in said
@@ -113,6 +120,16 @@ def test_the_pairs_of_starts_are_turned_with_their_truth(room_scans: tuple) -> N
     assert target is room_scans[1]
 
 
+def test_where_the_default_s_pairs_come_from(room_scans: tuple) -> None:
+    source, target = (scan[::4] for scan in room_scans)
+    row = starts.where(iter([(source, target, np.eye(4))]))
+    assert row["pairs"] == 1
+    assert row["right"] == 1
+    assert row["start"] in ("features 1", "rival 1", "search 1")
+    assert 0 < row["IC"] < row["IC look"]  # type: ignore[operator]
+
+
+@pytest.mark.slow
 def test_starts_are_counted_on_a_folder(tmp_path: Path, room_scans: tuple) -> None:
     for name, scan in zip("ab", room_scans, strict=True):
         write_cloud(tmp_path / f"{name}.ply", PointCloud(scan))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,13 +13,16 @@ import numpy as np
 from fmr_cli.batch.cache import CloudCache
 from fmr_cli.batch.manifest import Pair
 from fmr_cli.batch.results import COLUMNS
-from fmr_cli.errors import FmrError, ModelError
+from fmr_cli.errors import CloudFileError, FmrError, ModelError
 from fmr_cli.io import WRITABLE, open_cloud, write_cloud
+from fmr_cli.io.addresses import located
 from fmr_cli.io.files import reason
 from fmr_cli.registration import Options, Registration, align
 from fmr_cli.registration.export import aligned_cloud, merged_cloud, metrics
 from fmr_cli.registration.options import read_init
-from fmr_cli.workers.base import check_there, kept
+from fmr_cli.workers.base import UnfitError, check_there, kept
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # of one machine's disk: another worker may have some
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,8 @@ class PairRunner:
     """Registers pairs, in any process.
 
     folder: what the manifest's paths are relative to; out: the batch's folder; both absolute. aligned, merged: also
-    write each pair's moved source, or both clouds in one. cached_points: of files that a process keeps.
+    write each pair's moved source, or both clouds in one. cached_points: of files that a process keeps. remote: whether
+    another worker may have more room on its disk.
     """
 
     folder: Path
@@ -56,12 +61,13 @@ class PairRunner:
     aligned: bool
     merged: bool
     cached_points: int
+    remote: bool = False
 
     def files(self, pair: Pair) -> tuple[Path, Path]:
-        return self.folder / pair.source, self.folder / pair.target
+        return located(self.folder, pair.source), located(self.folder, pair.target)
 
     def do(self, block: Block) -> list[Done]:
-        """The block's pairs. Raises ModelError, and UnfitError where this machine lacks a file that others have."""
+        """The block's pairs. Raises ModelError, and UnfitError where this machine lacks a file, or room for one."""
         check_there(block.there)
         cache = kept("batch", lambda: CloudCache(self.cached_points))
         done = [self.one(pair, cache) for pair in block.pairs]
@@ -69,11 +75,11 @@ class PairRunner:
         return done
 
     def one(self, pair: Pair, cache: CloudCache) -> Done:
-        """One pair; its clouds are written. Raises ModelError alone, which is the same for every pair."""
+        """One pair; its clouds are written. Raises ModelError, which is the same for every pair, and UnfitError."""
         start = time.perf_counter()
         try:
             done = self._registered(pair, cache)
-        except ModelError:
+        except (ModelError, UnfitError):
             raise
         except FmrError as error:
             done = failed(pair, " ".join(str(error).split()))
@@ -85,7 +91,13 @@ class PairRunner:
         options = replace(self.options, init=read_init(pair.init, self.folder)) if pair.init else self.options
         source, target = (cache.get(path, seed=self.options.seed) for path in self.files(pair))
         found = align(source.prepared, target.prepared, options, threads=1)
-        said = [*found.reasons, *found.warnings, *self._write_clouds(pair, found.T_target_source)]
+        try:
+            written = self._write_clouds(pair, found.T_target_source)
+        except CloudFileError as error:
+            if self.remote and getattr(error.__cause__, "errno", None) in NO_ROOM:
+                raise UnfitError(str(error)) from error
+            raise
+        said = [*found.reasons, *found.warnings, *written]
         row = empty_row(pair) | described(found)
         row |= {"transform": f"transforms/{pair.name}.txt", "message": "; ".join(said)}
         return Done(row, found.T_target_source, metrics(source.said, target.said, found))

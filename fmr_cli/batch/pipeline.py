@@ -51,7 +51,7 @@ def align_batch(
             (out / folder).mkdir(exist_ok=True)
         team = on_this_machine(workers, len(todo))
         points = REMOTE_POINTS if team.remote else CACHED_POINTS // team.count
-        runner = PairRunner(manifest.parent.absolute(), out.absolute(), options, aligned, merged, points)
+        runner = PairRunner(manifest.parent.absolute(), out.absolute(), options, aligned, merged, points, team.remote)
         most = min(MOST, 1 + len(todo) // (BLOCKS * team.count))
         with closing(registered(runner, todo, team, most)) as results:
             for pair, done in zip(todo, results, strict=True):

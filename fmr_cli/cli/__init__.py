@@ -1,0 +1,1 @@
+"""The command `fmr`: one module a command; `app.py` puts them together."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +21,9 @@ from fmr_cli.cli.options import (
     takes_registration_options,
 )
 from fmr_cli.registration.options import Options
+
+if TYPE_CHECKING:
+    from fmr_cli.cloud import PointCloud
 
 
 @takes_registration_options
@@ -47,6 +50,8 @@ def align_command(
     verbose: Verbose = 0,
 ) -> None:
     """Find the transform that moves SOURCE onto TARGET."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from fmr_cli import io
     from fmr_cli.io import outputs
 
@@ -63,18 +68,15 @@ def align_command(
 
         named = columns(bin_columns)
         boxes = (None, target_bounds)
-        moving, fixed = (
-            io.read_cloud(path, attributes=False, at_most=AT_MOST, bin_columns=named, bounds=box)
-            for path, box in zip((source, target), boxes, strict=True)
-        )
+
+        def read(path: Path, box: tuple[float, ...] | None) -> PointCloud:
+            return io.read_cloud(path, attributes=False, at_most=AT_MOST, bin_columns=named, bounds=box)
+
+        with ThreadPoolExecutor(2) as pool:
+            moving, fixed = pool.map(read, (source, target), boxes)
         with quick_imports():  # after reading: a bad file is said at once
             from fmr_cli.registration import align, export
-            from fmr_cli.registration.mirror import HINT as MIRRORED
-            from fmr_cli.registration.pipeline import mirror_fits
         found = align(moving, fixed, options, check=bool(metrics or as_json or verbose))
-        if found.status != "aligned" and not options.allow_mirror:
-            fits = mirror_fits(moving, fixed, options)
-            found.warnings += [] if fits is None else [MIRRORED.format(fits)]
     T, said, warnings = found.T_target_source, export.metrics(moving, fixed, found), [*found.warnings]
     files = [
         io.open_cloud(path, bin_columns=named, bounds=box) for path, box in zip((source, target), boxes, strict=True)
@@ -109,7 +111,7 @@ def align_command(
     say(*export.summary(moving, fixed, found), quiet=quiet)
     warn(*warnings, quiet=quiet)
     if view:
-        from fmr_cli.report.view import view_pair
+        from fmr_cli.report.view_window import view_pair
 
         view_pair(files[0], files[1], T)
     if found.status != "aligned":

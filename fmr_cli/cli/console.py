@@ -52,7 +52,7 @@ def show_log(verbose: int) -> None:
         handler.setFormatter(logging.Formatter("%(relativeCreated)6.0f ms %(name)s: %(message)s"))
 
 
-def busy(text: str, quiet: bool) -> AbstractContextManager:
+def busy(text: str, quiet: bool) -> AbstractContextManager[object]:
     """A sign of life on a terminal while its block runs."""
     return err.status(text) if err.is_terminal and not quiet else nullcontext()
 

@@ -15,22 +15,24 @@ from fmr_cli.errors import FmrError
 if TYPE_CHECKING:
     from fmr_cli.evaluation.benchmark import Outcome
     from fmr_cli.evaluation.experiments import Row
-    from fmr_cli.evaluation.plan import OnDataset, OnScans
+    from fmr_cli.evaluation.plan import OnDataset, OnPairsOfItsOwn, OnScans
     from fmr_cli.workers import Workers
 
 FEATURES = "features"  # the maps of the paper's Figure 7: plots alone, no table
 EXPERIMENTS = "rotation,density,noise,overlap,scenes,features"
+POINTS = 1024  # of each cloud in them, the paper's
 PAIRS = 40  # at each level of an experiment: a standard error of 0.08 at most; the default takes minutes
 
 
 def evaluate_command(
     scans: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
-            help="Folders of a data set, or a CSV of pairs; or folders of scans or meshes, each a set of its own.",
+            help="Folders of a data set, or a CSV of pairs; or folders of scans or meshes, each a set of its own. "
+            "Without any, refine and cross-source run on made-up ones.",
             show_default=False,
         ),
-    ],
+    ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="For results.csv, pairs.csv and plots.")] = Path(
         "evaluation"
     ),
@@ -44,8 +46,10 @@ def evaluate_command(
     experiments: Annotated[
         str | None,
         typer.Option(
-            help=f"The paper's experiments, comma-separated: {EXPERIMENTS.replace(',', ', ')}.",
-            show_default="all, where SCANS are no data set",
+            help=f"The paper's, comma-separated: {EXPERIMENTS.replace(',', ', ')}. refine: ways to take the "
+            "last step compared, under noise, thinning, outliers, between sensors. cross-source: photogrammetry onto "
+            "other sensors.",
+            show_default="all of the paper's, where SCANS are no data set",
         ),
     ] = None,
     model: Annotated[
@@ -68,7 +72,10 @@ def evaluate_command(
             show_default=f"{PAIRS}; of a data set, all",
         ),
     ] = None,
-    points: Annotated[int, typer.Option(help="Of each cloud, in the experiments.", min=16)] = 1024,
+    points: Annotated[
+        int | None,
+        typer.Option(help="Of each cloud, in the experiments.", min=16, show_default=f"{POINTS}; refine: 8192"),
+    ] = None,
     iterations: Annotated[int, typer.Option(help="Of the solver.", min=1)] = 10,
     plain: Annotated[bool, typer.Option("--plain/--no-plain", help="The paper's plain least squares as well.")] = True,
     workers: Annotated[
@@ -86,15 +93,20 @@ def evaluate_command(
     as quoted. On a folder of scans, the paper's experiments: errors by initial rotation, density, noise and overlap, of
     random pairs of centred clouds; lengths are in units of the cloud (its largest extent about 1).
     """
+    scans = scans or []
     from fmr_cli.cores import usable_cores
     from fmr_cli.evaluation.datasets import recognised
-    from fmr_cli.evaluation.plan import Compared, OnDataset, OnScans, absolute
+    from fmr_cli.evaluation.plan import Compared, OnDataset, OnPairsOfItsOwn, OnScans, absolute
 
     check_report(report)
     if dataset and experiments:
         raise FmrError("--dataset and --experiments: give one of the two; the experiments draw pairs of their own")
+    if not scans and not experiments:
+        raise FmrError("no SCANS: give a data set or folders of scans, or --experiments refine or cross-source")
     name = dataset or (None if experiments else recognised(scans))
     chosen = [] if name else chosen_experiments(experiments or EXPERIMENTS)
+    if not scans and (unable := [name for name in chosen if not_made_up(name)]):
+        raise FmrError(f"--experiments {','.join(unable)}: give folders of scans; `fmr example objects` makes some")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -107,15 +119,16 @@ def evaluate_command(
         if name:
             run_dataset(OnDataset(name, absolute(scans), compared, pairs), team, out, quiet, report)
         else:
-            plan = OnScans(absolute(scans), compared, clouds, pairs or PAIRS, points)
-            rows = run_experiments(chosen, plan, team, out, quiet)
+            count = pairs or PAIRS
+            plan = OnScans(absolute(scans), compared, clouds, count, points or POINTS)
+            own = OnPairsOfItsOwn(absolute(scans), clouds, count, points, seed)
+            rows = run_experiments(chosen, plan, own, team, out, quiet)
     if report and not name:
         from fmr_cli.report.evaluation_page import write_evaluation
 
         said = {"scans": ", ".join(map(str, scans)), "methods": ", ".join(dict.fromkeys(row.method for row in rows))}
-        write_evaluation(
-            report, rows, said | {"pairs": plan.pairs, "points": points, "iterations": iterations, "seed": seed}
-        )
+        said["experiments"] = ", ".join(chosen)
+        write_evaluation(report, rows, said | {"pairs": count, "iterations": iterations, "seed": seed})
     say(f"written to {out}", quiet=quiet)
 
 
@@ -169,15 +182,23 @@ def run_pairs(plan: OnDataset, team: Workers, quiet: bool) -> list[Outcome]:
     return rows
 
 
-def run_experiments(chosen: list[str], plan: OnScans, team: int | Workers | None, out: Path, quiet: bool) -> list[Row]:
-    """The paper's experiments on folders of scans: tables printed, results.csv and plots in ``out``."""
-    from fmr_cli.evaluation.experiments import EXPERIMENTS
+def run_experiments(
+    chosen: list[str], plan: OnScans, own: OnPairsOfItsOwn, team: int | Workers | None, out: Path, quiet: bool
+) -> list[Row]:
+    """Experiments: tables printed, results.csv and plots in ``out``.
+
+    plan: for the paper's; own: for those that make their pairs.
+    """
+    from fmr_cli.evaluation.catalogue import EXPERIMENTS
     from fmr_cli.report.evaluation import plot, table, write_csv
     from fmr_cli.report.plots import can_plot
     from fmr_cli.workers.local import on_this_machine
 
-    sets, _, missing = plan.made()
+    papers = [name for name in chosen if not_made_up(name)]
+    sets, missing = (plan.made()[0], plan.made()[2]) if papers else (own.made(), [])
     warn(*(line for read in sets for line in read.skipped), *missing, quiet=quiet)
+    if own.paths and "cross-source" in chosen:
+        warn("cross-source: its pairs are made up, whatever the scans", quiet=quiet)
     plots = can_plot()
     if not plots:
         warn("no plots, matplotlib is not installed; pip install 'fmr-cli[eval]'", quiet=quiet)
@@ -187,8 +208,8 @@ def run_experiments(chosen: list[str], plan: OnScans, team: int | Workers | None
             if plots:
                 plot_features(plan, out)
             continue
-        experiment = EXPERIMENTS[name]
-        found = [row for level in plan.run(experiment, on_this_machine(team, 2)) for row in level]
+        experiment, how = EXPERIMENTS[name], plan if name in papers else own
+        found = [row for level in how.run(experiment, on_this_machine(team, 2)) for row in level]
         Console(highlight=False).print(table(experiment, found))
         if plots and len(experiment.levels) > 1:
             plot(out / f"{name}.png", experiment, found)
@@ -198,14 +219,22 @@ def run_experiments(chosen: list[str], plan: OnScans, team: int | Workers | None
 
 
 def chosen_experiments(text: str) -> list[str]:
-    """The names in a comma-separated list. Raises FmrError for one that there is not."""
-    from fmr_cli.evaluation.experiments import EXPERIMENTS
+    """The names in a comma-separated list, groups as what they stand for. Raises FmrError for one that there is not."""
+    from fmr_cli.evaluation.catalogue import EXPERIMENTS, GROUPS, PAPER
 
-    names, known = [name.strip() for name in text.split(",")], [*EXPERIMENTS, FEATURES]
+    names = [name.strip() for name in text.split(",")]
     for name in names:
-        if name not in known:
+        if name not in (*EXPERIMENTS, *GROUPS, FEATURES):
+            known = [*PAPER, FEATURES, *GROUPS, *(name for name in EXPERIMENTS if name not in PAPER)]
             raise FmrError(f"--experiments {name}: no such experiment; choose from {', '.join(known)}")
-    return names
+    return [one for name in names for one in GROUPS.get(name, (name,))]
+
+
+def not_made_up(name: str) -> bool:
+    """Whether an experiment needs scans."""
+    from fmr_cli.evaluation.catalogue import PAPER
+
+    return name == FEATURES or name in PAPER
 
 
 def plot_features(plan: OnScans, out: Path) -> None:

@@ -21,6 +21,7 @@ from fmr_cli.registration.options import Options, flag, read_init
 if TYPE_CHECKING:
     from fmr_cli.workers import Workers
 
+Command = Callable[..., None]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
 Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, help="Say what was decided and why; -vv says more.")
@@ -85,9 +86,9 @@ def check_picture(path: Path | None) -> None:
 def check_screen(wanted: bool) -> None:
     """Before a long computation: --view has a screen. Raises FmrError."""
     if wanted:
-        from fmr_cli.report import view
+        from fmr_cli.report import view_window
 
-        view.check_screen()
+        view_window.check_screen()
 
 
 def columns(given: str | None) -> tuple[str, ...] | None:
@@ -104,7 +105,7 @@ def columns(given: str | None) -> tuple[str, ...] | None:
 ALL_OPTIONS = tuple(field.name for field in fields(Options))
 
 
-def registration_parameter(f: Field) -> Parameter:
+def registration_parameter(f: Field[Any]) -> Parameter:
     """A field of Options as a parameter of a command. Options checks its value, so that every message is one line."""
     text = f.metadata["help"]
     names = [flag(f.name)] if f.default is False else []  # what is off by default needs no --no-
@@ -113,7 +114,7 @@ def registration_parameter(f: Field) -> Parameter:
     return Parameter(f.name, Parameter.KEYWORD_ONLY, default=f.default, annotation=Annotated[kind, info])
 
 
-def takes_registration_options(command: Callable, names: Sequence[str] = ALL_OPTIONS) -> Callable:
+def takes_registration_options(command: Command, names: Sequence[str] = ALL_OPTIONS) -> Command:
     """Gives a command the options of a registration, or those named; they come to it as one argument, ``options``."""
 
     def run(**given: Any) -> None:
@@ -126,7 +127,7 @@ def takes_registration_options(command: Callable, names: Sequence[str] = ALL_OPT
     return with_parameters(command, run, more, without="options")
 
 
-def takes_debug(command: Callable) -> Callable:
+def takes_debug(command: Command) -> Command:
     """Gives a command --debug, which ``main`` looks for by itself."""
 
     def run(**given: Any) -> None:
@@ -136,7 +137,7 @@ def takes_debug(command: Callable) -> Callable:
     return with_parameters(command, run, [Parameter("debug", Parameter.KEYWORD_ONLY, default=False, annotation=Debug)])
 
 
-def with_parameters(command: Callable, run: Callable, more: list[Parameter], without: str = "") -> Callable:
+def with_parameters(command: Command, run: Command, more: list[Parameter], without: str = "") -> Command:
     """``run`` in the place of ``command``, with its name, its text and its parameters, some more and one less."""
     signature = inspect.signature(command, eval_str=True)
     parameters = [*(p for p in signature.parameters.values() if p.name != without), *more]

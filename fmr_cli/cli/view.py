@@ -52,17 +52,20 @@ def show(
     screenshot: Path | None, html: Path | None, quiet: bool,
 ) -> None:  # fmt: skip
     """The clouds of ``fmr view`` in the ways asked for."""
-    from fmr_cli.report import view
+    from fmr_cli.report.coloring import missing, with_residuals
+    from fmr_cli.report.view_clouds import load, read_section
+    from fmr_cli.report.view_page import ON_PAGE, write_view
+    from fmr_cli.report.view_window import IN_WINDOW, Window
 
     with busy("reading", quiet):
-        clouds, notes = view.load(files, transform, result, view.IN_WINDOW if screenshot or not html else view.ON_PAGE)
+        clouds, notes = load(files, transform, result, IN_WINDOW if screenshot or not html else ON_PAGE)
         if len(clouds) > 1:
-            clouds = view.with_residuals(clouds)
-        cut = view.read_section(section, clouds)
-    say(*notes, *view.missing(clouds, color), quiet=quiet)
+            clouds = with_residuals(clouds)
+        cut = read_section(section, clouds)
+    say(*notes, *missing(clouds, color), quiet=quiet)
     if html:
-        view.write_view(html, clouds, color, size, cut)
+        write_view(html, clouds, color, size, cut)
     if screenshot:
-        view.Window(clouds, color, size, cut).save(screenshot)
+        Window(clouds, color, size, cut).save(screenshot)
     if not html and not screenshot:
-        view.Window(clouds, color, size, cut).run()
+        Window(clouds, color, size, cut).run()

@@ -1,0 +1,1 @@
+"""Local patch descriptors, their matching, and poses that many matches agree on."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def fpfh_ransac(source: np.ndarray, target: np.ndarray, voxel: float) -> np.ndar
     return np.array(found.transformation)
 
 
-def _fpfh(points: np.ndarray, voxel: float) -> tuple:
+def _fpfh(points: np.ndarray, voxel: float) -> tuple[Any, Any]:
     """Open3D's cloud on the grid, and its features."""
     o3d = open3d()
     near = o3d.geometry.KDTreeSearchParamHybrid

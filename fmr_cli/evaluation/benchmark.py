@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -106,7 +107,7 @@ def aligned(options: Options, threads: int) -> Method:
     """The product: `fmr align`, from nothing but the two clouds."""
 
     def run(source: np.ndarray, target: np.ndarray) -> Estimate:
-        found = align(PointCloud(source), PointCloud(target), options, threads)
+        found = align(PointCloud(source), PointCloud(target), options, threads, hints=False)
         return Estimate(found.T_target_source, found.status, found.confidence)
 
     return run
@@ -189,5 +190,5 @@ def summarise(rows: Iterable[Outcome], by_scene: bool) -> list[Summary]:
     return found
 
 
-def mean(values: list) -> float:
+def mean(values: Sequence[Any]) -> float:
     return float(np.mean(values)) if values else np.nan

@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from fmr_cli.errors import FmrError
-from fmr_cli.evaluation.heldout import Setting, draw, errors
+from fmr_cli.evaluation.heldout import Errors, Setting, draw, errors
 from fmr_cli.evaluation.methods import Method
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.solver import make_template, solve
@@ -25,15 +26,27 @@ GRID = 100  # voxel edges in a cloud's size: evens out the density, and is finer
 SHIFT = 0.8  # of the unit box, the paper's; centring takes it out
 SHOWN = (1, 5, 10)  # iterations of the feature maps, as in the paper's Figure 7: the first, half-way, the last
 LEAST_POINTS = 100  # of a scan: fewer say nothing about a surface
+How = TypeVar("How")  # what a level does to a pair
+
+
+SOLVER: tuple[tuple[str, str], ...] = (
+    ("success", "share below 5 deg"),
+    ("rotation_median", "median rotation error, deg"),
+    ("shift_median", "median shift error"),
+)
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """A series of settings. axis: what the levels are; levels: (value on the axis, setting)."""
+class Experiment(Generic[How]):
+    """A series of settings. axis: what the levels are; levels: (value on the axis, setting).
+
+    measures: what its plots show, (field of ``Row``, label).
+    """
 
     name: str
     axis: str
-    levels: tuple[tuple[float, Setting], ...]
+    levels: tuple[tuple[float, How], ...]
+    measures: tuple[tuple[str, str], ...] = SOLVER
 
 
 _start = Setting("", (0.0, 60.0), SHIFT)
@@ -64,7 +77,13 @@ class Clouds:
 
 @dataclass(frozen=True)
 class Row:
-    """What a method did at one level. Rotations in degrees; shifts in units of the normalised cloud."""
+    """What a method did at one level. Rotations in degrees; shifts in units of the normalised cloud.
+
+    success: the share that is right, below 5 deg if not said otherwise. What an experiment does not measure is None:
+    limit_median, the median rotation error that noise allows (``cramer_rao``), and limit_ratio, the median of the
+    error over it; scale_median, the error of the scale as a share; aligned_right, aligned_wrong, the shares of the
+    pairs that are ``aligned`` and right, and ``aligned`` and not.
+    """
 
     experiment: str
     clouds: str
@@ -79,6 +98,11 @@ class Row:
     rmse_mean: float
     rmse_median: float
     seconds: float
+    limit_median: float | None = None
+    limit_ratio: float | None = None
+    scale_median: float | None = None
+    aligned_right: float | None = None
+    aligned_wrong: float | None = None
 
 
 def read_clouds(path: Path, count: int | None, points: int, device: torch.device) -> Clouds:
@@ -106,7 +130,13 @@ def read_clouds(path: Path, count: int | None, points: int, device: torch.device
 
 
 def at_level(
-    experiment: Experiment, number: int, clouds: Clouds, methods: dict[str, Method], pairs: int, points: int, seed: int
+    experiment: Experiment[Setting],
+    number: int,
+    clouds: Clouds,
+    methods: dict[str, Method],
+    pairs: int,
+    points: int,
+    seed: int,
 ) -> list[Row]:
     """Every method on the same ``pairs`` random pairs at one level, by its number."""
     level, setting = experiment.levels[number]
@@ -117,12 +147,20 @@ def at_level(
         estimate = method(drawn)
         seconds = (time.perf_counter() - started) / pairs
         e = errors(estimate, drawn.truth)
-        means, medians = ([float(f(x)) for x in (e.rotation, e.translation, e.rmse)] for f in (np.mean, np.median))
-        rows.append(Row(
-            experiment.name, clouds.name, name, float(level), pairs, e.success, means[0], medians[0],
-            means[1], medians[1], means[2], medians[2], seconds,
-        ))  # fmt: skip
+        rows.append(make_row(experiment, clouds.name, name, level, e, e.success, seconds))
     return rows
+
+
+def make_row(
+    experiment: Experiment[Any], clouds: str, method: str, level: float, e: Errors, success: float, seconds: float,
+    **more: float | None,
+) -> Row:  # fmt: skip
+    """The row of a method's errors at one level; more: the fields that not every experiment measures."""
+    means, medians = ([float(f(x)) for x in (e.rotation, e.translation, e.rmse)] for f in (np.mean, np.median))
+    return Row(
+        experiment.name, clouds, method, float(level), len(e.rotation), success, means[0], medians[0],
+        means[1], medians[1], means[2], medians[2], seconds, **more,
+    )  # fmt: skip
 
 
 @torch.inference_mode()

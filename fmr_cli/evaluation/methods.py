@@ -38,7 +38,7 @@ def product() -> Method:
 
     def run(source: np.ndarray, target: np.ndarray) -> np.ndarray:
         try:
-            return align(PointCloud(source), PointCloud(target)).T_target_source
+            return align(PointCloud(source), PointCloud(target), hints=False).T_target_source
         except RegistrationError:  # too few points; half a turn off is what `errors` makes of it
             return np.full((4, 4), np.nan)
 

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
 from fmr_cli.errors import FmrError
-from fmr_cli.evaluation import benchmark, experiments
+from fmr_cli.evaluation import benchmark, cross_source, experiments, last_step
 from fmr_cli.evaluation.benchmark import Outcome, failed, outcomes
+from fmr_cli.evaluation.catalogue import EXPERIMENTS
 from fmr_cli.evaluation.datasets import read_dataset
 from fmr_cli.evaluation.datasets.pair import DataSet
-from fmr_cli.evaluation.experiments import EXPERIMENTS, Clouds, Experiment, Row, read_clouds
+from fmr_cli.evaluation.experiments import Clouds, Experiment, Row, read_clouds
 from fmr_cli.evaluation.methods import Method, baselines, ours, product
 from fmr_cli.registration.models import Device, encoder, fast_encoder, pick_device
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import one_blas_thread
+from fmr_cli.synthetic.cross_source import SENSORS
 from fmr_cli.workers import Workers
 from fmr_cli.workers.base import LostError, UnfitError, kept
 
@@ -50,7 +52,7 @@ class OnDataset:
 
     def made(self) -> tuple[DataSet, dict[str, benchmark.Method], list[str]]:
         """The data set, the methods by the name in the tables, a line for each method that cannot run here."""
-        return kept(repr(self), self._make)  # type: ignore[no-any-return]
+        return kept(repr(self), self._make)
 
     def _make(self) -> tuple[DataSet, dict[str, benchmark.Method], list[str]]:
         what, found, lines = self.compared, {}, []
@@ -96,7 +98,7 @@ class OnScans:
 
     def made(self) -> tuple[list[Clouds], dict[str, Method], list[str]]:
         """The sets of clouds, the methods by the name in the tables, a line for each method that cannot run here."""
-        return kept(repr(self), self._make)  # type: ignore[no-any-return]
+        return kept(repr(self), self._make)
 
     def _make(self) -> tuple[list[Clouds], dict[str, Method], list[str]]:
         what, lines = self.compared, list[str]()
@@ -122,17 +124,66 @@ class OnScans:
             EXPERIMENTS[name], level, sets[place], methods, self.pairs, self.points, self.compared.seed
         )
 
-    def run(self, experiment: Experiment, team: Workers) -> Generator[list[Row], None, None]:
+    def run(self, experiment: Experiment[Any], team: Workers) -> Generator[list[Row], None, None]:
         """The rows of an experiment, set by set and level by level."""
-        tasks = [
-            (experiment.name, place, level)
-            for place in range(len(self.paths))
-            for level in range(len(experiment.levels))
-        ]
-        for done in team.run(self.rows, tasks):
-            if isinstance(done, LostError):
-                raise done
-            yield done
+        return level_by_level(self.rows, experiment, len(self.paths), team)
+
+
+@dataclass(frozen=True)
+class OnPairsOfItsOwn:
+    """The experiments that make their pairs: last steps from near starts, and cross-source pairs.
+
+    The former on the scans, without any on made-up ones; the latter always made up. As ``OnScans``; points: None for
+    what suits the experiment.
+    """
+
+    paths: tuple[Path, ...]
+    clouds: int | None
+    pairs: int
+    points: int | None
+    seed: int
+
+    @property
+    def size(self) -> int:
+        """Points of each cloud."""
+        return self.points or last_step.POINTS
+
+    def made(self) -> list[Clouds]:
+        """The sets of clouds that are given."""
+        return kept(repr(self), self._make)
+
+    def _make(self) -> list[Clouds]:
+        return [read_clouds(path, self.clouds, self.size, torch.device("cpu")) for path in self.paths]
+
+    def sets(self, experiment: Experiment[Any]) -> int:
+        """How many sets of pairs an experiment has."""
+        return len(SENSORS) if experiment.name in cross_source.EXPERIMENTS else max(len(self.paths), 1)
+
+    def rows(self, task: tuple[str, int, int]) -> list[Row]:
+        """Every method at one level: (experiment, number of the set, number of the level)."""
+        name, place, level = task
+        with one_blas_thread():
+            if name in cross_source.EXPERIMENTS:
+                return cross_source.at_level(EXPERIMENTS[name], level, place, self.pairs, self.seed)
+            sets = on_worker(self.made)
+            clouds = sets[place] if sets else None
+            return last_step.at_level(EXPERIMENTS[name], level, clouds, self.pairs, self.size, self.seed)
+
+    def run(self, experiment: Experiment[Any], team: Workers) -> Generator[list[Row], None, None]:
+        """The rows of an experiment, set by set and level by level."""
+        return level_by_level(self.rows, experiment, self.sets(experiment), team)
+
+
+def level_by_level(
+    rows: Callable[[tuple[str, int, int]], list[Row]], experiment: Experiment[Any], sets: int, team: Workers
+) -> Generator[list[Row], None, None]:
+    """Rows of (experiment, set, level), for each set and level, by the workers. Raises what lost one of them."""
+    for done in team.run(
+        rows, [(experiment.name, n, level) for n in range(sets) for level in range(len(experiment.levels))]
+    ):
+        if isinstance(done, LostError):
+            raise done
+        yield done
 
 
 def on_worker(make: Callable[[], Made]) -> Made:

@@ -66,7 +66,7 @@ def judge(pair: VerdictPair, number: int, origins: bool = False) -> Judged:
         source.sensor_origin, target.sensor_origin = pair.source_origin, pair.target_origin
     begin = time.perf_counter()
     try:
-        found = align(source, target, Options(), threads=1)
+        found = align(source, target, Options(), threads=1, hints=False)
     except FmrError as error:
         took = time.perf_counter() - begin
         return Judged(

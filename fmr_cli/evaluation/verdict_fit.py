@@ -8,7 +8,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fmr_cli.evaluation.verdict_evidence import Judged
-from fmr_cli.registration.confidence import QUALITY, Weights, confidences, products, sigmoid, standing
+from fmr_cli.registration.confidence import QUALITY, confidences, products, sigmoid, standing
+from fmr_cli.registration.verdict_weights import Weights
 
 RIDGE = 2e-3  # on the standardised weights of support and fit: next to nothing where the evidence decides
 PRODUCT_RIDGE = 3.0  # on those of the verdict, of as many observations: of 3, 10 and 30 the best on other pairs

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from fmr_cli.feature_metric.layers import Layers, hidden
 CHUNK = 256  # points; their activation of CHUNK x K (1 MB at 1024 channels) stays in cache
 ROUNDING = 1e-6  # of a feature: what float32 leaves between two ways to compute it
 
-Run = Callable[[Callable, Iterable], Iterable]
+Run = Callable[[Callable[..., Any], Iterable[Any]], Iterable[Any]]
 
 
 @contextmanager

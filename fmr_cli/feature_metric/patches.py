@@ -6,8 +6,9 @@ with its own feature
     F_c(P) = max over p in P with |u| < 1 of (1 - |u|²) f(u),   u = (p - c) / radius
 
 with f the encoder's first layers. The factor (1 - |u|²) lets a point enter or leave the ball without a jump. The
-Jacobian comes once from the target's critical points, as for the global feature; every iteration weights each ball by
-its residual (Geman-McClure), so that balls without a counterpart drop out.
+Jacobian comes once from the target's critical points, as for the global feature (where asked for, its mean with the
+moved source's); every iteration weights each ball by its residual (Geman-McClure), so that balls without a counterpart
+drop out.
 """
 
 from __future__ import annotations
@@ -34,9 +35,13 @@ Neighbourhoods = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass
 class PatchTemplate:
-    """The target's side. centres (P, 3); feature (P, C); J (P, C, 6); JtJ (P, 6, 6); count (P,) points in each ball."""
+    """The target's side.
+
+    centres (P, 3); radius of the balls; feature (P, C); J (P, C, 6); JtJ (P, 6, 6); count (P,) points in each ball.
+    """
 
     centres: np.ndarray
+    radius: float
     feature: np.ndarray
     J: np.ndarray
     JtJ: np.ndarray
@@ -73,6 +78,14 @@ def patch_features(layers: Layers, offsets: np.ndarray, valid: np.ndarray) -> np
 def patch_template(layers: Layers, centres: np.ndarray, look: Neighbourhoods, radius: float) -> PatchTemplate:
     """F_c and its exact Jacobian at the target; centres and radius in the target's normalised frame."""
     offsets, valid = look(centres)
+    feature, J = feature_and_jacobian(layers, centres, offsets, valid, radius)
+    return PatchTemplate(centres, radius, feature, J, np.swapaxes(J, 1, 2) @ J, valid.sum(1))
+
+
+def feature_and_jacobian(
+    layers: Layers, centres: np.ndarray, offsets: np.ndarray, valid: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """F_c (P, C) of points (P, n, 3) in balls about ``centres``, and dF_c(exp(-xi) x)/dxi at 0, exact: (P, C, 6)."""
     values = pointwise(layers, offsets, valid)
     index = values.argmax(1)  # [P x C], the critical points
     feature = np.take_along_axis(values, index[:, None], 1)[:, 0]
@@ -86,8 +99,7 @@ def patch_template(layers: Layers, centres: np.ndarray, look: Neighbourhoods, ra
     window = 1 - (u * u).sum(-1, keepdims=True)
     gradient = (window * slope - 2 * u * value[..., None]) / radius
     p = centres[:, None] + radius * u
-    J = pose_jacobian(p, gradient) * (feature > 0)[..., None]
-    return PatchTemplate(centres, feature, J, np.swapaxes(J, 1, 2) @ J, valid.sum(1))
+    return feature, pose_jacobian(p, gradient) * (feature > 0)[..., None]
 
 
 def refine(
@@ -97,15 +109,24 @@ def refine(
     g: np.ndarray,
     iterations: int,
     basis: np.ndarray | None = None,
+    both: bool = False,
 ) -> PatchFit:
     """Iterate from g (4, 4), float64; ``look`` finds the balls' points in the source's own frame.
 
-    basis: (6, d) orthonormal twists that the motion may use; None for all six.
+    basis: (6, d) orthonormal twists that the motion may use; None for all six. both: steps by the mean of the target's
+    and the moved source's Jacobian, as for the global feature, rather than by the target's alone.
     """
     for iteration in range(iterations + 1):
         inverse = np.linalg.inv(g)
         offsets, valid = look(template.centres @ inverse[:3, :3].T + inverse[:3, 3])
-        r = patch_features(layers, offsets @ g[:3, :3].T.astype(np.float32), valid) - template.feature
+        moved = offsets @ g[:3, :3].T.astype(np.float32)
+        if both and iteration < iterations:
+            feature, J_source = feature_and_jacobian(layers, template.centres, moved, valid, template.radius)
+            J = (template.J + J_source) / 2
+            JtJ = np.swapaxes(J, 1, 2) @ J
+        else:
+            feature, J, JtJ = patch_features(layers, moved, valid), template.J, template.JtJ
+        r = feature - template.feature
         error = np.linalg.norm(r, axis=1)
         occupied = valid.sum(1) >= MIN_SHARE * template.count
         if occupied.sum() < 3:
@@ -114,7 +135,7 @@ def refine(
         s2 = max((fall * np.median(error[occupied])) ** 2, 1e-12)
         weight = geman_mcclure(error**2, s2) * occupied
         if iteration < iterations:
-            A = np.tensordot(weight, template.JtJ, 1)
-            b = weight @ (r[:, None] @ template.J)[:, 0]
+            A = np.tensordot(weight, JtJ, 1)
+            b = weight @ (r[:, None] @ J)[:, 0]
             g = exp(capped(constrained_step(A, b, basis), MAX_STEP)) @ g
     return PatchFit(g, np.where(occupied, error, np.nan), weight)

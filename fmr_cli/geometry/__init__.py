@@ -1,0 +1,1 @@
+"""What is true of points and poses whatever the method."""

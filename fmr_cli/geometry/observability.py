@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.geometry.kernels import geman_mcclure
+from fmr_cli.geometry.kernels import geman_mcclure, geman_mcclure_slope
 from fmr_cli.geometry.point_to_plane import SCALE, linearise, normal_equations
+from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_keys
 
@@ -35,14 +36,16 @@ class Certainty:
 def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, origin: np.ndarray) -> Certainty:
     """Of the twist in the target's frame about ``origin`` (3,), by point-to-plane at a pose, both ways.
 
-    With A = Σ w J Jᵀ and g_b = Σ w J r over block b of neighbouring voxels, the covariance is A⁻¹ (Σ g_b g_bᵀ) A⁻¹ (the
-    sandwich of cluster-robust regression, Liang and Zeger 1986): it holds however the residuals within a block hang
-    together, be it by noise that voxels share or by a surface that is bent. Where the residuals' own optimum lies
-    further from the pose than this covariance allows, it grows to what allows it (Birge's ratio). A misfit beyond
-    the surfaces' own roughness, as of scans that are bent or drifted, is the same over large parts, of which
+    The covariance is that of a robust estimate of correlated observations (Huber's sandwich, by blocks: Liang and Zeger
+    1986). With the pull ψ = w r of a residual and its slope ψ' by r, D = Σ ψ' J Jᵀ and g_b = Σ ψ J over block b of
+    neighbouring voxels, it is D⁻¹ (Σ g_b g_bᵀ) D⁻¹, however the residuals within a block hang together, be it by noise
+    that voxels share or by a surface that is bent. Each g_b is divided by what the block itself leaves of it
+    (I - D_b D⁻¹: the jackknife), since the pose follows a block that alone holds a direction. Where the residuals' own
+    optimum lies further from the pose than this covariance allows, it grows to what allows it (Birge's ratio). A misfit
+    beyond the surfaces' own roughness, as of scans that are bent or drifted, is the same over large parts, of which
     there are BENDS.
     """
-    A, scores, misfits, sums = np.zeros((6, 6)), [], [], np.zeros(2)
+    seen, misfits = [], []
     back = np.linalg.inv(T_target_source)
     for a, b, T, swapped in ((source, target, T_target_source, False), (target, source, back, True)):
         moved = transform_points(T, a.points)
@@ -54,25 +57,51 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
         if swapped:  # the target's points on the source's planes, both seen in the target's frame
             x, y, n = transform_points(T_target_source, y), a.points[here], n @ T_target_source[:3, :3].T
         r, J = linearise(x, y, n, origin)
-        w = geman_mcclure(r * r, (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * b.edge) ** 2)
-        A += normal_equations(J, r, w)[0]
-        blocks, index = np.unique(voxel_keys(y, BLOCK * b.edge), return_inverse=True)
-        scores.append(np.stack([np.bincount(index, row, len(blocks)) for row in J * (w * r)], 1))
-        sums += [w @ (r * r), w.sum()]
+        scale2 = (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * b.edge) ** 2
+        seen.append(np.vstack([r, geman_mcclure(r * r, scale2), geman_mcclure_slope(r * r, scale2), J, y.T]))
         misfits.append(NORMAL**2 * (np.median(np.abs(r)) ** 2 - np.median(b.unevenness[0][match[here]]) ** 2))
-    variance = sums[0] / max(sums[1], 1e-12)
-    information = A / 2 / max(variance, (1e-6 * target.edge) ** 2)
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-9, hermitian=True) / np.outer(scale, scale)
-    covariance = inverse * sums[1] * max(sum(misfits), 0.0) / 2 / BENDS  # a misfit that no roughness explains
-    g = np.concatenate(scores) if scores else np.zeros((0, 6))
-    if len(g) >= LEAST_BLOCKS:
-        meat = g.T @ g * 2 * len(g) / (len(g) - 6)  # twice: the two ways see the same surfaces
-        sandwich, step = inverse @ meat @ inverse, inverse @ g.sum(0)
-        covariance += sandwich * max(step @ np.linalg.pinv(sandwich, rcond=1e-9, hermitian=True) @ step / 6, 1.0)
+    if not seen:
+        return Certainty(np.zeros((6, 6)), np.zeros((6, 6)))
+    r, w, slope, *rows = np.hstack(seen)
+    J, y = np.stack(rows[:6]), np.stack(rows[6:], 1)
+    A = normal_equations(J, r, w)[0]
+    variance = max(float(w @ (r * r) / max(w.sum(), 1e-12)), (1e-6 * target.edge) ** 2)
+    units = np.sqrt(np.maximum(np.diag(A), 1e-300))  # radians and lengths compare once each is divided by its own
+    J = J / units[:, None]
+    inverse = pseudo_inverse(A / np.outer(units, units))
+    covariance = inverse * w.sum() * max(sum(misfits), 0.0) / 2 / BENDS
+    block, index = np.unique(voxel_keys(y, BLOCK * target.edge), return_inverse=True)
+    if len(block) >= LEAST_BLOCKS:
+        covariance += sandwich(J, w * r, slope, index)
     else:
-        covariance += inverse * max(variance, (1e-6 * target.edge) ** 2)
-    return Certainty(information, covariance)
+        covariance += inverse * variance
+    return Certainty(A / 2 / variance, covariance / np.outer(units, units))
+
+
+def sandwich(J: np.ndarray, pull: np.ndarray, slope: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """The covariance (6, 6) of a robust estimate; see ``certainty``. J (6, N); the others (N,), block from 0 up."""
+    count = int(block.max()) + 1
+    pairs = np.stack([a * b * slope for a in J for b in J])
+    D_b = np.stack([np.bincount(block, row, count) for row in pairs], 1).reshape(count, 6, 6)
+    g_b = np.stack([np.bincount(block, row, count) for row in J * pull], 1)
+    inverse = pseudo_inverse(D_b.sum(0))
+    step = inverse @ g_b.sum(0)
+    g_b = np.linalg.solve(np.eye(6) - D_b @ inverse, (g_b - D_b @ step)[..., None])[..., 0]
+    found = inverse @ (g_b.T @ g_b) @ inverse * (count - 1) / count
+    return found * max(float(step @ pseudo_inverse(found) @ step) / 6, 1.0)
+
+
+def pseudo_inverse(A: np.ndarray) -> np.ndarray:
+    """Of a symmetric matrix, without the directions that rounding alone holds."""
+    return np.linalg.pinv(A, rcond=1e-9, hermitian=True)
+
+
+def about(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """The information (6, 6) of the twist about the origin as that of the twist about ``centre`` (3,)."""
+    shift = np.eye(4)
+    shift[:3, 3] = centre
+    M = adjoint(shift)
+    return M.T @ information @ M
 
 
 def undetermined(info: np.ndarray, length: float, basis: np.ndarray | None = None) -> list[str]:

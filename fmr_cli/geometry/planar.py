@@ -41,8 +41,9 @@ def raised(points: np.ndarray, normal: np.ndarray, rng: np.random.Generator) -> 
 
 
 def within_plane(T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The pose next to T (4, 4) that takes the plane through the source's centre, of unit normal ``source`` (3,), onto
-    the target's; both centres are the frames' origins.
+    """The pose next to T (4, 4) that takes the source's plane onto the target's.
+
+    Each goes through its cloud's centre, which is its frame's origin, and has a unit normal (3,).
     """
     T = T_target_source.copy()
     moved = T[:3, :3] @ source

@@ -55,6 +55,15 @@ def step_motion(step: np.ndarray, pivot: np.ndarray | None = None) -> np.ndarray
     return M
 
 
+def with_scale(basis: np.ndarray, scale: bool) -> np.ndarray:
+    """The steps of ``basis`` (6, d), and with ``scale`` those of log s as well: (7, d + 1)."""
+    if not scale:
+        return basis
+    B = np.zeros((7, basis.shape[1] + 1))
+    B[:6, :-1], B[6, -1] = basis, 1
+    return B
+
+
 @dataclass
 class Normal:
     """The normal equations of point-to-plane at a pose: A = Σ w JᵀJ and b = Σ w Jᵀr over the step (omega, v, log s).
@@ -104,10 +113,8 @@ def constrained(
     """Point-to-plane from T (4x4) within the span of basis (6, d), and with one scale factor where asked."""
     tree = cKDTree(target)
     normals = normals_and_variation(target, *neighbours(target, tree))[0]
-    B = np.zeros((7, basis.shape[1] + scale))
-    B[:6, : basis.shape[1]] = basis
-    if scale:
-        B[6, -1] = 1
+    B = with_scale(basis, scale)
+    free = len(B)
     pivot = target.mean(0)
     g = T.copy()
     for iteration in range(ITERATIONS):
@@ -115,7 +122,8 @@ def constrained(
         normal = point_to_plane(source, target, normals, tree, g, reach, pivot)
         if normal.count < 6:
             return T
-        step = -B @ np.linalg.lstsq(B.T @ normal.A @ B, B.T @ normal.b, rcond=1e-12)[0]
+        A, b = normal.A[:free, :free], normal.b[:free]
+        step = -B @ np.linalg.lstsq(B.T @ A @ B, B.T @ b, rcond=1e-12)[0]
         g = step_motion(step, pivot) @ g
         if np.abs(step[:3]).max() < STILL and np.abs(step[3:6]).max() < STILL * edge:
             break

@@ -69,6 +69,14 @@ def log(T: Array) -> Array:
     return xp.concat([omega, v[..., 0]], axis=-1)
 
 
+def adjoint(T: Array) -> Array:
+    """(..., 4, 4) -> (..., 6, 6): A with T exp(xi) = exp(A xi) T; a twist in T's source axes as one in its target's."""
+    xp = namespace(T)
+    R = T[..., :3, :3]
+    top = xp.concat([R, xp.zeros_like(R)], axis=-1)
+    return xp.concat([top, xp.concat([hat(T[..., :3, 3]) @ R, R], axis=-1)], axis=-2)
+
+
 def half_angle_axis(q: Array) -> Array:
     """(..., 4) unit quaternion (w >= 0) -> (..., 3): its axis times half its angle."""
     xp = namespace(q)

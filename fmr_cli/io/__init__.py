@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -12,10 +13,11 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
+from fmr_cli.io.addresses import address_of, local, shown
 from fmr_cli.io.files import atomic_write, check_readable, reason
 from fmr_cli.io.mesh import Mesh
 from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name, topic_of
-from fmr_cli.io.stream import CloudStream, Wanted, collect, stream_of
+from fmr_cli.io.stream import CloudStream, Wanted, ahead, collect, stream_of
 from fmr_cli.io.transforms import read_poses, read_transform, transform_text, write_poses, write_transform
 from fmr_cli.vectors import unturned
 
@@ -82,25 +84,27 @@ def open_cloud(
     enough: a reader that can (COPC) may stop at so many points that are spread evenly.
     """
     module, kind, file, part = find_module(Path(path), SUFFIXES)
-    if not is_bag_folder(file):
-        check_readable(file)
+    check_there(file)
     box = checked_bounds(bounds)
     if resolution is not None and module.__name__ != "fmr_cli.io.las":
         raise CloudFileError(f"{path}: has no levels, --resolution needs a COPC (.copc.laz)")
-    wanted = Wanted(attributes, part, bin_columns, box, resolution, enough, topic)
 
-    def chunks() -> Iterator[PointCloud]:
+    def chunks(attributes: bool = attributes) -> Iterator[PointCloud]:
+        wanted = Wanted(attributes, part, bin_columns, box, resolution, enough, topic)
         points = dropped = 0
-        for chunk in guarded(module.read(file, wanted), file):
+        with naming(file):
+            here = local(file)
+        for chunk in ahead(guarded(module.read(here, wanted), file)):
             if isinstance(chunk, Mesh):
                 with naming(file):
                     cloud, form = chunk.sample(mesh_points, seed), "mesh"
             else:
                 cloud, form = chunk, kind
-            finite = np.isfinite(cloud.points).all(axis=1)
-            bad = int(len(finite) - finite.sum())
-            if bad:
-                cloud = cloud.select(finite)
+            finite = np.isfinite(cloud.points)
+            bad = 0
+            if not finite.all():  # point by point takes ten times as long
+                whole = finite.all(axis=1)
+                bad, cloud = int(len(whole) - whole.sum()), cloud.select(whole)
             if box is not None:
                 inside = (cloud.points >= np.array(box[:3])) & (cloud.points <= np.array(box[3:]))
                 cloud = cloud.select(np.flatnonzero(inside.all(axis=1)))
@@ -108,12 +112,12 @@ def open_cloud(
             points, dropped = points + len(cloud), dropped + bad
             yield cloud
         if points == 0 and box is not None:
-            raise CloudFileError(f"{path}: has no points within the bounds, compare them with `fmr info`")
+            raise CloudFileError(f"{shown(path)}: has no points within the bounds, compare them with `fmr info`")
         if points == 0:
             what = f"none of its {dropped} points has finite coordinates" if dropped else "holds no points"
-            raise CloudFileError(f"{path}: {what}, check how it was written")
+            raise CloudFileError(f"{shown(path)}: {what}, check how it was written")
 
-    return CloudStream(chunks, str(path))
+    return CloudStream(chunks, shown(path), bare=partial(chunks, attributes=False))
 
 
 def read_cloud(
@@ -129,7 +133,8 @@ def read_cloud(
 ) -> PointCloud:
     """Reads a point cloud; points with NaN or infinite coordinates are dropped and counted in ``dropped``.
 
-    path: FILE, or FILE#2 or FILE#name for one scan of a file that holds several.
+    path: FILE, or FILE#2 or FILE#name for one scan of a file that holds several; or an address (s3://bucket/a.laz) that
+        fsspec knows, of which a copy is made.
     mesh_points: how many points to sample from the surface of a mesh; by default as many as it has vertices, at
         least 10,000 and at most 1,000,000. 0 gives the vertices themselves. ``seed`` makes the sample repeatable.
     attributes: False leaves everything but the coordinates in the file, which saves time and memory.
@@ -172,7 +177,8 @@ def scans_of(path: str | Path, topic: str | None = None) -> list[ScanPart]:
         return [ScanPart("", np.eye(4), 0)]
     check_scan(path)
     with naming(file):
-        return module.scans(file, topic) if topic is not None else module.scans(file)
+        here = local(file)
+        return module.scans(here, topic) if topic is not None else module.scans(here)
 
 
 def scan_paths(path: str | Path, topic: str | None = None) -> list[Path]:
@@ -192,13 +198,19 @@ def holds_scans(path: str | Path) -> bool:
     except CloudFileError:
         return False
     whole = part is None or topic_of(part) is not None
-    return whole and file.exists() and module.__name__.rsplit(".", 1)[1] in PARTED
+    there = file.exists() or address_of(file) is not None
+    return whole and there and module.__name__.rsplit(".", 1)[1] in PARTED
 
 
 def check_scan(path: str | Path) -> None:
     """Raises CloudFileError where the file of a scan, FILE or FILE#part, is not there or of no kind that is read."""
     _, _, file, _ = find_module(Path(path), SUFFIXES)
-    if not is_bag_folder(file):
+    check_there(file)
+
+
+def check_there(file: Path) -> None:
+    """Raises CloudFileError where there is no such file. What is elsewhere is asked for when it is read."""
+    if address_of(file) is None and not is_bag_folder(file):
         check_readable(file)
 
 
@@ -245,30 +257,44 @@ def naming(path: Path) -> Iterator[None]:
         with np.errstate(all="ignore"):
             yield
     except CloudFileError as error:
-        raise CloudFileError(f"{path}: {error}") from error
+        raise CloudFileError(f"{shown(path)}: {error}") from error
     except MemoryError as error:
-        raise CloudFileError(f"{path}: does not fit into this machine's memory, thin it out first") from error
+        raise CloudFileError(f"{shown(path)}: does not fit into this machine's memory, thin it out first") from error
     except Exception as error:
-        raise CloudFileError(f"{path}: cannot be read as {path.suffix} ({reason(error)}), is it damaged?") from error
+        what = f"cannot be read as {path.suffix} ({reason(error)}), is it damaged?"
+        raise CloudFileError(f"{shown(path)}: {what}") from error
+
+
+def parted(path: Path) -> tuple[Path, str]:
+    """The file and the part that FILE#part means; a # may be in either's name, the longest name of a file counts."""
+    places = [at for at, letter in enumerate(path.name) if letter == "#" and at]
+    for at in reversed(places):
+        if path.with_name(path.name[:at]).exists():
+            break
+    else:
+        at = max(places, default=0)
+    return (path.with_name(path.name[:at]) if at else path), path.name[at + 1 :]
 
 
 def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str, Path, str | None]:
-    """The module for a path's suffix, which must be among ``suffixes``, and the format's name; the file, and the part
-    of it that is meant: FILE#2 is a part of FILE, unless there is a file of that very name.
+    """The module for a path's suffix, which must be among ``suffixes``, and the format's name; the file and its part.
+
+    FILE#2 is a part of FILE, unless there is a file of that very name.
     """
     part = None
     if "#" in path.name and suffixes is SUFFIXES and not path.exists():
-        name, part = path.name.rsplit("#", 1)
-        path = path.with_name(name) if name else path
+        path, part = parted(path)
     if suffixes is SUFFIXES and is_bag_folder(path):
         return importlib.import_module("fmr_cli.io.bags"), "bag", path, part
     packed = path.suffix.lower() == ".gz"
     suffix = path.with_suffix("").suffix.lower() if packed else path.suffix.lower()
     full = f"{suffix}.gz" if packed else suffix
     if full not in suffixes:
+        if path.is_dir():
+            raise CloudFileError(f"{path}: is a folder, give a file in it")
         what = f"the suffix {full!r} cannot be {'read' if suffixes is SUFFIXES else 'written'}"
-        raise CloudFileError(f"{path}: {what if full else 'has no suffix'}, use one of {' '.join(suffixes)}")
+        raise CloudFileError(f"{shown(path)}: {what if full else 'has no suffix'}, use one of {' '.join(suffixes)}")
     module, kind = FORMATS[suffix]
     if part is not None and module not in PARTED:
-        raise CloudFileError(f"{path}: holds one scan, take the #{part} off its name")
+        raise CloudFileError(f"{shown(path)}: holds one scan, take the #{part} off its name")
     return importlib.import_module(f"fmr_cli.io.{module}"), kind, path, part

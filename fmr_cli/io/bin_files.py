@@ -1,7 +1,8 @@
-""".bin: numbers and nothing else. 3 to 8 float32 a point (KITTI 4, nuScenes 5), some of them uint32; float64; records
-with a 2-byte ring as drivers pack them; NCLT's 8 bytes a point.
+""".bin: numbers and nothing else.
 
-How many, and what they are, stands nowhere: it is told by the values, unless `Wanted.bin_columns` names them.
+3 to 8 float32 a point (KITTI 4, nuScenes 5), some of them uint32; float64; records with a 2-byte ring as drivers pack
+them; NCLT's 8 bytes a point. How many, and what they are, stands nowhere: it is told by the values, unless
+`Wanted.bin_columns` names them.
 """
 
 from __future__ import annotations
@@ -66,17 +67,20 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
 def record_of(columns: Iterable[str]) -> np.dtype:
     """The record of columns "name" (float32) or "name:type" (numpy's name of the type, little endian)."""
     given = [column.partition(":") for column in columns]
+    names = [name for name, _, _ in given]
+    said = f"--bin-columns {','.join(columns)}:"
+    if not {*"xyz"} <= {*names} or len({*names}) < len(names):
+        raise CloudFileError(f"{said} there must be one x, one y and one z, and each other name once")
     try:
         return np.dtype([(name, np.dtype(kind or "f4").newbyteorder("<")) for name, _, kind in given])
     except TypeError as error:
-        raise CloudFileError(
-            f"--bin-columns {','.join(columns)}: {error}; types are such as f4, f8, u1, u2, i4"
-        ) from None
+        raise CloudFileError(f"{said} {error}; types are such as f4, f8, u1, u2, i4") from None
 
 
 def find_columns(path: Path, size: int) -> tuple[str, ...] | None:
-    """What a point holds, told by the values; None for NCLT's records. Raises CloudFileError where nothing fits, or
-    two layouts do.
+    """What a point holds, told by the values; None for NCLT's records.
+
+    Raises CloudFileError where nothing fits, or two layouts do.
     """
     sample = sample_of(path, size, "<f4")
     holes = np.isnan(sample).sum() > 0.1 * len(sample)  # colours with an alpha are NaN as float32
@@ -149,8 +153,9 @@ def plausible(sample: np.ndarray) -> bool:
 
 
 def columns_of(sample: np.ndarray, size: int, kind: str) -> tuple[str, ...]:
-    """The columns of numbers of one type, told by the values. Raises CloudFileError where nothing fits, or two widths
-    do.
+    """The columns of numbers of one type, told by the values.
+
+    Raises CloudFileError where nothing fits, or two widths do.
     """
     fitting = [width for width in WIDTHS if size % (sample.itemsize * width) == 0]
     if not fitting:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -40,10 +40,10 @@ def info_of(header: laspy.LasHeader) -> Any | None:
     return found[0] if found else None
 
 
-def cells_of(file: BinaryIO, info: Any, size: int) -> list[Cell]:
+def cells_of(file: BinaryIO, info: Any, size: int, chunks: Collection[tuple[int, int, int]]) -> list[Cell]:
     """All cells that hold points, in the file's order. Raises CloudFileError where the octree is damaged.
 
-    size: of the file in bytes.
+    size: of the file in bytes. chunks: its LAZ chunks, each by its place, bytes and points: cells are some of them.
     """
     damaged = CloudFileError("has a damaged COPC octree: copy it again, or read it as plain LAZ without bounds")
     found: list[Cell] = []
@@ -55,14 +55,16 @@ def cells_of(file: BinaryIO, info: Any, size: int) -> list[Cell]:
             raise damaged
         file.seek(offset)
         for level, x, y, z, start, count_bytes, count in ENTRY.iter_unpack(file.read(length)):
-            if not 0 <= level <= DEEPEST or count < -1 or count_bytes < 0 or start + count_bytes > size:
+            if count == 0:
+                continue
+            page = count == -1
+            known = page or (start, count_bytes, count) in chunks
+            if not 0 <= level <= DEEPEST or not known or (start, count_bytes) in seen:
                 raise damaged
-            if count == -1:
-                if (start, count_bytes) in seen:
-                    raise damaged
-                seen.add((start, count_bytes))
+            seen.add((start, count_bytes))
+            if page:
                 pages.append((start, count_bytes))
-            elif count:
+            else:
                 side = 2 * info.halfsize / 2**level
                 low = info.center - info.halfsize + np.array([x, y, z]) * side
                 found.append(Cell(level, low, low + side, start, count_bytes, count))
@@ -70,8 +72,9 @@ def cells_of(file: BinaryIO, info: Any, size: int) -> list[Cell]:
 
 
 def wanted_cells(cells: list[Cell], info: Any, wanted: Wanted) -> list[Cell]:
-    """Those within the bounds, down to the level of the resolution; where points at most are wanted, down to the level
-    with which there are enough.
+    """Those within the bounds, down to the level of the resolution.
+
+    Where points at most are wanted, down to the level with which there are enough.
     """
     if wanted.bounds is not None:
         low, high = np.array(wanted.bounds[:3]), np.array(wanted.bounds[3:])
@@ -89,16 +92,12 @@ def wanted_cells(cells: list[Cell], info: Any, wanted: Wanted) -> list[Cell]:
 
 
 def records(
-    file: BinaryIO, header: laspy.LasHeader, cells: list[Cell], selection: laspy.DecompressionSelection, limit: int
+    file: BinaryIO, header: laspy.LasHeader, cells: list[Cell], selection: laspy.DecompressionSelection
 ) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """The points of the cells, some CHUNK at a time. limit: how many times the points are larger than their chunk at
-    most. Raises CloudFileError where a cell promises more.
-    """
+    """The points of the cells, some CHUNK at a time."""
     laszip = header.vlrs.get("LasZipVlr")[0].record_data
     width = header.point_format.size
     for group in grouped(cells):
-        if any(cell.count * width > limit * (cell.size + 1) for cell in group):
-            raise CloudFileError("has a COPC cell that promises more points than it can hold, it is damaged")
         packed = bytearray()
         for cell in group:
             file.seek(cell.offset)

@@ -57,7 +57,7 @@ def horizontal(crs: str) -> Node | None:
 
 
 def code_of(crs: str) -> str | None:
-    """ "EPSG:n" of the horizontal system, where it is stated."""
+    """The code ``EPSG:n`` of the horizontal system, where it is stated."""
     if re.fullmatch(r"EPSG:\d+", crs.strip(), re.IGNORECASE):
         return crs.strip().upper()
     node = horizontal(crs)

@@ -67,19 +67,19 @@ def slabs_of(stream: CloudStream) -> list[np.ndarray]:
     """All points (N, 3), or of many those in ten slabs across the longest side, TREE / 10 in each at most."""
     survey = stream.survey
     if survey.count <= TREE:
-        return [np.concatenate([chunk.points for chunk in stream])]
+        return [np.concatenate([*stream.coordinates()])]
     axis = int(np.argmax(survey.high - survey.low))
-    thin = np.sort(collect((PointCloud(chunk.points) for chunk in stream), TREE // SLABS).points[:, axis])
+    thin = np.sort(collect(map(PointCloud, stream.coordinates()), TREE // SLABS).points[:, axis])
     share = TREE / SLABS / survey.count  # of all points, that a slab is to hold
     starts = np.linspace(0, len(thin) * (1 - share), SLABS).astype(int)
     bounds = [(thin[start], thin[min(start + max(int(len(thin) * share), 1), len(thin) - 1)]) for start in starts]
     parts: list[list[np.ndarray]] = [[] for _ in bounds]
     held = np.zeros(SLABS, int)
-    for chunk in stream:
-        values = chunk.points[:, axis]
+    for points in stream.coordinates():
+        values = points[:, axis].copy()  # side by side in memory
         for k, (low, high) in enumerate(bounds):
             if held[k] < TREE // SLABS * 2:  # where many lie in one plane, a slab of no width holds them all
-                inside = chunk.points[(values >= low) & (values <= high)]
+                inside = points[(values >= low) & (values <= high)]
                 parts[k].append(inside)
                 held[k] += len(inside)
     return [slab for slab in map(np.concatenate, parts) if len(slab)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io.fields import fields_of, lost_context, storable, unique
+from fmr_cli.io.fields import Field, fields_of, lost_context, storable, unique
 from fmr_cli.io.parts import ScanPart, choose, proper
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
 
@@ -213,7 +213,7 @@ def prepare_file(lib: Any, file: Any, survey: Survey) -> None:
 class ScanSink:
     """One scan of a file that is written: its points in its own frame."""
 
-    def __init__(self, lib: Any, file: Any, first: PointCloud, survey: Survey, fields: list) -> None:
+    def __init__(self, lib: Any, file: Any, first: PointCloud, survey: Survey, fields: list[Field]) -> None:
         from scipy.spatial.transform import Rotation
 
         self.fields = fields

@@ -14,6 +14,7 @@ import numpy as np
 from fmr_cli.cloud import NORMALS, PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.stream import COLORS, CloudStream, Column, Survey
+from fmr_cli.io.transforms import as_transform
 
 ALIASES = {
     **{f"normal{axis}": f"n{axis}" for axis in "xyz"},
@@ -69,6 +70,19 @@ def refuse_degrees(names: Iterable[str]) -> None:
             "holds longitude and latitude, and degrees are no lengths: project it first, to UTM say "
             "(pyproj, `pdal translate --filters.reprojection.out_srs=...`, QGIS)"
         )
+
+
+def refuse_poses(rows: np.ndarray) -> None:
+    """Raises CloudFileError where numbers (N, k) are those of a 4x4 transform, or each row those of a pose."""
+    poses = rows.reshape(1, 16) if rows.shape == (4, 4) else rows if rows.shape[1] in (12, 16) else rows[:0]
+    try:
+        for pose in poses:
+            as_transform(pose.astype(np.float64), mirror=True)
+    except CloudFileError:
+        return
+    if len(poses):
+        what = "a 4x4 transform" if rows.shape == (4, 4) else "poses"
+        raise CloudFileError(f"holds {what} and no points: give a cloud")
 
 
 def unique(names: Iterable[str]) -> list[str]:

@@ -54,8 +54,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
     try:
         with ClippedFile(path) as file, laspy.open(file, decompression_selection=selection, closefd=False) as reader:
             header = reader.header
-            if header.are_points_compressed and header.point_count:
-                check_layers(file, header)
+            packed = header.are_points_compressed and header.point_count
+            chunks_there = check_layers(file, header) if packed else set()
             if header.point_count == 0:
                 raise CloudFileError("holds no points (its header says 0), check how it was written")
             dimensions = header.point_format.dimensions
@@ -73,8 +73,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
             chunks, expected = reader.chunk_iterator(CHUNK), header.point_count
             info = copc.info_of(header)
             if info is not None and (wanted.bounds or wanted.resolution or wanted.at_most):
-                cells = copc.wanted_cells(copc.cells_of(file, info, file.size), info, wanted)
-                chunks, expected = copc.records(file, header, cells, selection, LAZ_LIMIT), sum(c.count for c in cells)
+                cells = copc.wanted_cells(copc.cells_of(file, info, file.size, chunks_there), info, wanted)
+                chunks, expected = copc.records(file, header, cells, selection), sum(c.count for c in cells)
             elif wanted.resolution:
                 raise CloudFileError("has no levels, --resolution needs a COPC: make one with `untwine` or `pdal`")
             total = header.point_count if wanted.at_most and expected < header.point_count else None
@@ -156,16 +156,19 @@ def check_chunks(file: io.BufferedReader, size: int, start: int, count: int, poi
         raise CloudFileError("has a damaged table of compressed chunks: copy it again")
 
 
-def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
+def check_layers(file: ClippedFile, header: laspy.LasHeader) -> set[tuple[int, int, int]]:
     """LAZ: chunks, and in 1.4 their layers, must be of a possible size, since lazrs allocates what they promise.
 
-    Leaves the file at the start of the points.
+    Returns where each chunk is, its bytes and its points; leaves the file at the start of the points.
     """
     records = header.vlrs.get("LasZipVlr")
     if not records:
         raise CloudFileError("is compressed and lacks the record that says how, it is damaged: copy it again")
     record = records[0].record_data
-    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(struct.unpack_from("<H", record, 32)[0])]
+    chunk_points, count = struct.unpack_from("<I", record, 12)[0], struct.unpack_from("<H", record, 32)[0]
+    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(count)]
+    if chunk_points == 0 or sum(size for _, size in items) != header.point_format.size:
+        raise CloudFileError("does not say rightly how its points are compressed, it is damaged: copy it again")
     layers = sum(LAYERS.get(kind, size) for kind, size in items if kind >= min(LAYERS))
     file.seek(header.offset_to_point_data)
     table = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
@@ -177,13 +180,17 @@ def check_layers(file: ClippedFile, header: laspy.LasHeader) -> None:
         raise CloudFileError("promises more points than its compressed data can hold, it is damaged: copy it again")
     start = header.offset_to_point_data + 8
     raw = sum(size for _, size in items) + 4  # a chunk begins with its first point as it is and a count
-    for _, size in [chunk for chunk in table if chunk[0]] if layers else []:
-        file.seek(start)
-        head = file.read(raw + 4 * layers)
-        if len(head) < raw + 4 * layers or len(head) + sum(struct.unpack_from(f"<{layers}I", head, raw)) > size:
-            raise CloudFileError("has a damaged compressed chunk: copy it again")
+    found = set()
+    for count, size in table:
+        found.add((start, size, count))
+        if layers and count:
+            file.seek(start)
+            head = file.read(raw + 4 * layers)
+            if len(head) < raw + 4 * layers or len(head) + sum(struct.unpack_from(f"<{layers}I", head, raw)) > size:
+                raise CloudFileError("has a damaged compressed chunk: copy it again")
         start += size
     file.seek(header.offset_to_point_data)
+    return found
 
 
 def garbled_waveforms(path: Path, header: laspy.LasHeader) -> bool:

@@ -20,8 +20,9 @@ FEWEST, MOST = 10_000, 1_000_000  # points sampled by default; in between, as ma
 
 @dataclass
 class Mesh:
-    """Vertices (as a cloud with attributes, not yet checked for NaN), the (M, 3) indices of its triangles, and
-    attributes of the triangles: name -> (M,).
+    """Vertices, the (M, 3) indices of their triangles, and attributes of the triangles: name -> (M,).
+
+    The vertices are a cloud with attributes, not yet checked for NaN.
     """
 
     vertices: PointCloud
@@ -84,6 +85,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
 
 @dataclass
 class Parsed:
+    """What the lines of a mesh file say."""
+
     vertices: list[list[float]]
     faces: list[list[int]]
     colors: list[list[float]]  # three or four numbers for each vertex, or for each face; none where not for all
@@ -155,7 +158,7 @@ def read_obj(lines: Lines) -> Parsed:
         if kind == "v":
             vertices.append(numbers(lines, rest[:3], 3))
             if len(rest) in (6, 7):
-                colors.append(numbers(lines, rest[3:6], 3))
+                colors.append(numbers(lines, rest[3:], len(rest) - 3))
         elif kind == "f":
             corners = [int(n) for n in numbers(lines, [word.split("/")[0] for word in rest], len(rest))]
             faces.append([n - 1 if n > 0 else len(vertices) + n for n in corners])
@@ -223,8 +226,12 @@ def fan(
         lengths = np.fromiter(map(len, faces), np.int64, len(faces))
         which = [np.flatnonzero(lengths == k) for k in np.unique(lengths)]
         groups = [(np.array([faces[i] for i in index.tolist()], np.int64), index) for index in which]
-    parts = [(g[:, [0, i, i + 1]], index) for g, index in groups if g.ndim == 2 for i in range(1, g.shape[1] - 1)]
-    if not parts:
-        return np.empty((0, 3), np.int64), {name: values[:0] for name, values in of_faces.items()}
-    origin = np.concatenate([index for _, index in parts])
-    return np.concatenate([p for p, _ in parts]), {name: values[origin] for name, values in of_faces.items()}
+    triangles, origin = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    for corners, index in groups:
+        if corners.ndim == 2 and corners.shape[1] >= 3:
+            second, third = corners[:, 1:-1].T, corners[:, 2:].T  # all polygons' first triangles come first
+            first = np.broadcast_to(corners[:, 0], second.shape)
+            triangles.append(np.stack([first, second, third], -1).reshape(-1, 3))
+            origin.append(np.tile(index, len(second)))
+    face = np.concatenate(origin)
+    return np.concatenate(triangles), {name: values[face] for name, values in of_faces.items()}

@@ -22,6 +22,7 @@ from fmr_cli.io.fields import (
     native,
     parted,
     refuse_degrees,
+    refuse_poses,
     to_cloud,
 )
 from fmr_cli.io.stream import CHUNK, CloudStream, Column, Wanted
@@ -32,6 +33,7 @@ OWN = ("points", "crs", "sensor_origin", "file")  # names an attribute in an NPZ
 KEYS = ("points", "xyz", "pts", "pos", "positions", "coords", "coordinates", "vertices", "point_cloud", "pointcloud",
         "pcd", "pc", "cloud", "data", "arr_0")  # fmt: skip
 WIDEST = 16  # columns a point may have that have no names
+HEAD = 200  # rows that are looked at to tell poses from points
 FEWEST = 10  # points of a cloud: an array of fewer rows and more columns holds the points side by side
 
 
@@ -70,14 +72,15 @@ def as_rows(array: np.ndarray) -> np.ndarray:
     shape = array.shape
     if array.dtype.kind not in "biuf":
         raise CloudFileError(f"holds an array of {array.dtype}, points need numbers")
+    if len(shape) == 3 and shape[1:] in ((3, 4), (4, 4)):
+        refuse_poses(array[:HEAD].reshape(-1, math.prod(shape[1:])))
     if len(shape) == 3 and shape[2] in (3, 4, 6, 7):
         return array.reshape(-1, shape[2])  # a range image, or a batch of clouds
     if len(shape) == 3 and shape[0] == 3:
         return array.reshape(3, -1).T
-    if shape == (4, 4) and np.array_equal(array[3], [0, 0, 0, 1]):
-        raise CloudFileError("holds a 4x4 transform and no points: give a cloud")
     if len(shape) != 2 or min(shape) < 3:
         raise CloudFileError(f"holds an array of {shape}, points need (N, 3) numbers or more columns")
+    refuse_poses(array[:HEAD])
     rows, columns = shape
     if rows < FEWEST <= columns:
         return array.T

@@ -22,14 +22,17 @@ class ScanPart:
 
 
 def choose(parts: list[ScanPart], wanted: str | None) -> list[int]:
-    """The scans that are meant, by place from 0: all, or the one of that name, or of that number from 1."""
+    """The scans that are meant, by place from 0: all, or the one of that number from 1, or of that name.
+
+    A number comes first, so that ``io.scan_paths`` reaches every scan, whatever their names are.
+    """
     if wanted is None:
         return list(range(len(parts)))
+    if wanted.isascii() and wanted.isdecimal() and 1 <= int(wanted) <= len(parts):
+        return [int(wanted) - 1]
     named = [k for k, part in enumerate(parts) if part.name == wanted]
     if len(named) == 1:
         return named
-    if wanted.isascii() and wanted.isdecimal() and 1 <= int(wanted) <= len(parts):
-        return [int(wanted) - 1]
     names = ", ".join(part.name for part in parts[:20])
     what = f"has {len(named)} scans called {wanted!r}, give its number" if named else f"has no scan {wanted!r}"
     raise CloudFileError(f"{what}; there are {len(parts)}: {names}")

@@ -1,5 +1,8 @@
-"""PCD: ascii, binary and binary_compressed, of every version. Packed `rgb` becomes red, green, blue; VIEWPOINT the
-sensor's place. A compressed file is one block, which has to be in memory whole."""
+"""PCD: ascii, binary and binary_compressed, of every version.
+
+Packed `rgb` becomes red, green, blue; VIEWPOINT the sensor's place. A compressed file is one block, which has to be in
+memory whole.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -18,7 +21,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import Field, fields_of, storable, to_cloud, unique
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
-from fmr_cli.io.table import Lines, read_rows
+from fmr_cli.io.table import MOST_COLUMNS, Lines, read_rows
 
 LONGEST_HEADER = 1 << 20
 LINE_END = re.compile(rb"\r\n|\n|\r")
@@ -30,6 +33,8 @@ LZF_LIMIT = 90  # LZF cannot shrink data more than this many times
 
 @dataclass
 class Header:
+    """What the head of the file says."""
+
     fields: np.dtype  # packed, in the file's order; padding fields are called _, __2, ...
     points: int
     viewpoint: tuple[float, ...]  # x y z and a quaternion w x y z; empty where the file has none
@@ -116,6 +121,9 @@ def read_header(file: BinaryIO) -> Header:
         counts = [int(c) for c in words.get("COUNT", ["1"] * len(names))]
         if not len(names) == len(sizes) == len(kinds) == len(counts) or min(counts) < 0 or max(counts) > 1 << 20:
             raise ValueError
+        columns = sum(counts) if words["DATA"][0].lower() == "ascii" else len(names)
+        if columns > MOST_COLUMNS:
+            raise CloudFileError(f"declares {columns} values of a point, no point has so many")
         types = [f"{kind.lower()}{size}" for kind, size in zip(kinds, sizes, strict=True)]
         if any(kind not in ("f4", "f8", *(k + s for k in "iu" for s in "1248")) for kind in types):
             raise ValueError
@@ -196,7 +204,7 @@ def write(path: Path, stream: CloudStream) -> list[str]:
     rests = RESTS if coordinate == "<f4" and survey.rest > 0 else ()
     if rests and survey.rest > NOTABLE * (survey.high - survey.low).max():
         warnings.append(f"most readers of PCD take float32 only and will round coordinates by up to {survey.rest:.2g}")
-    layout: list[tuple] = [(axis, coordinate) for axis in "xyz"]
+    layout: list[tuple[Any, ...]] = [(axis, coordinate) for axis in "xyz"]
     layout += [(f.name, "<" + f.dtype.str[1:], f.shape) for f in fields]
     layout += [("rgba", "<u4") if len(packed) == 4 else ("rgb", "<f4")] if packed else []
     dtype = np.dtype(layout + [(name, "<f8") for name in rests])

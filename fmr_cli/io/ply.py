@@ -20,7 +20,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import fields_of, storable, to_cloud, unique, write_records
 from fmr_cli.io.mesh import Mesh, fan
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted, collect
-from fmr_cli.io.table import Lines, read_rows
+from fmr_cli.io.table import MOST_COLUMNS, Lines, read_rows
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -36,6 +36,8 @@ LONGEST_HEADER = 1 << 20
 
 @dataclass
 class Property:
+    """A property of an element, as the header declares it."""
+
     name: str
     type: str  # numpy's name, without the byte order
     count_type: str | None = None  # of a list
@@ -43,6 +45,8 @@ class Property:
 
 @dataclass
 class Element:
+    """An element, as the header declares it."""
+
     name: str
     count: int
     properties: list[Property] = field(default_factory=list)
@@ -61,6 +65,8 @@ class Element:
 
 @dataclass
 class Header:
+    """What the head of the file says."""
+
     order: str
     elements: list[Element]
     comments: dict[str, str]
@@ -116,6 +122,9 @@ def context_of(header: Header) -> dict[str, Any]:
     vertex = next(e for e in header.elements if e.name == "vertex")
     lists = [f"list property {p.name!r}" for p in vertex.properties if p.count_type]
     others = [f"element {e.name!r}" for e in header.elements if e.name not in ("vertex", "face")]
+    known = ("vertex_indices", "vertex_index", *(() if {*COLORS} & {p.name for p in vertex.properties} else COLORS))
+    faces = [p.name for e in header.elements if e.name == "face" and e.count for p in e.properties]
+    lists += [f"property {name!r} of the faces" for name in faces if name not in known]
     origin = np.array(header.comments.get("sensor_origin", "nan").split(), dtype=np.float64)
     return {
         "left_out": (*lists, *others),
@@ -213,6 +222,10 @@ def read_header(file: BinaryIO) -> Header:
     if order is None:
         raise CloudFileError("has a PLY header without a 'format' line")
     for element in elements:
+        if len(element.properties) > MOST_COLUMNS:
+            raise CloudFileError(
+                f"declares {len(element.properties)} properties of a {element.name}, no point has so many"
+            )
         for prop, name in zip(element.properties, unique([p.name for p in element.properties]), strict=True):
             prop.name = name
     return Header(order, elements, comments, number)
@@ -220,7 +233,7 @@ def read_header(file: BinaryIO) -> Header:
 
 def read_text_lists(lines: Lines, element: Element) -> dict[str, Any]:
     """One element of an ascii file with lists, one row a line; the lists as tuples."""
-    columns: dict[str, list] = {p.name: [] for p in element.properties}
+    columns: dict[str, list[Any]] = {p.name: [] for p in element.properties}
     rows = 0
     for line in islice(lines, element.count):
         words = iter(line.split())
@@ -251,7 +264,7 @@ def read_lists(file: BinaryIO, element: Element, order: str) -> dict[str, Any]:
 
     def row_layout(at: int) -> np.dtype:
         """The dtype of the row at a position, its lists as long as they are there."""
-        layout: list[tuple] = []
+        layout: list[tuple[Any, ...]] = []
         for p in element.properties:
             if p.count_type is None:
                 layout.append((p.name, order + p.type))
@@ -291,7 +304,7 @@ def read_lists(file: BinaryIO, element: Element, order: str) -> dict[str, Any]:
     return finish(element, columns)
 
 
-def finish(element: Element, columns: dict[str, list]) -> dict[str, Any]:
+def finish(element: Element, columns: dict[str, list[Any]]) -> dict[str, Any]:
     """Scalar columns as arrays of the declared type, list columns as they are."""
     return {
         p.name: columns[p.name] if p.count_type else np.array(columns[p.name], np.float64).astype(p.type)

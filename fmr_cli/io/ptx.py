@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,17 +17,20 @@ from fmr_cli.io.table import ROWS, Dialect, Lines, open_text, parse
 from fmr_cli.io.transforms import as_transform
 
 HEADER = 10  # lines: columns, rows, the scanner's place and axes, and a transform of four rows
+MANY, FEW = 1000, 10  # scans after each other of fewer points than a scan has
 FIELDS = ("intensity", *COLORS)
 
 
 def scans(path: Path) -> list[ScanPart]:
     """Name, pose and number of points of each scan; they have no names but their numbers."""
-    found: list = []
+    found: list[Any] = []
     with open_text(path) as file:
         lines = Lines(file)
         while (head := read_header(lines, len(found))) is not None:
             found.append(head)
             skip(lines, head.count)
+            if len(found) > MANY and sum(part.count for part in found[-MANY:]) < FEW * MANY:
+                raise CloudFileError(f"holds {MANY} scans of fewer than {FEW} points each, it is no PTX")
     return found
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from fmr_cli.cloud import PointCloud
 
 CHUNK = 1 << 18  # points that are in memory at a time; with LAS's attributes and their copies about 100 MB
 COLORS = ("red", "green", "blue")
+Item = TypeVar("Item")
 UNTYPED = ("xyz", "csv", "pts", "ptx", "npy", "npz", "kitti")  # formats whose columns have no type of their own
 
 
@@ -69,11 +72,23 @@ class CloudStream:
 
     All chunks have the same attributes of the same types, and say the same of the whole but for ``dropped``, and
     where a file has several scans, ``scan``, ``T_file_scan`` and ``sensor_origin``. turned: whether it is in another
-    orientation than its file, so that a write has to warn of what did not turn along.
+    orientation than its file, so that a write has to warn of what did not turn along. bare: the same points without
+    their attributes, where that takes less time.
     """
 
-    def __init__(self, chunks: Callable[[], Iterator[PointCloud]], name: str, turned: bool = False) -> None:
+    def __init__(
+        self,
+        chunks: Callable[[], Iterator[PointCloud]],
+        name: str,
+        turned: bool = False,
+        bare: Callable[[], Iterator[PointCloud]] | None = None,
+    ) -> None:
         self.chunks, self.name, self.turned = chunks, name, turned
+        self.bare = bare or chunks
+
+    def coordinates(self) -> Iterator[np.ndarray]:
+        """The points (n, 3) of each chunk."""
+        return (cloud.points for cloud in self.bare())
 
     def __iter__(self) -> Iterator[PointCloud]:
         return self.chunks()
@@ -105,7 +120,10 @@ class CloudStream:
             count += len(chunk)
             if not len(chunk):
                 continue
-            low, high = np.minimum(low, chunk.points.min(0)), np.maximum(high, chunk.points.max(0))
+            ends = np.array(
+                [[axis.min(), axis.max()] for axis in chunk.points.T]
+            )  # ten times as fast as min(0), max(0)
+            low, high = np.minimum(low, ends[:, 0]), np.maximum(high, ends[:, 1])
             with np.errstate(over="ignore", invalid="ignore"):
                 off = float(np.abs(chunk.points - chunk.points.astype(np.float32)).max())
             rest = max(rest, off if np.isfinite(off) else np.inf)
@@ -125,6 +143,15 @@ def narrow_colors(columns: dict[str, Column]) -> None:
         return
     for column in present:
         column.dtype = np.dtype(np.uint8 if max(c.high for c in present) <= 255 else np.uint16)
+
+
+def ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """The same items; the next one is made in a thread while one is worked on."""
+    with ThreadPoolExecutor(1, "read") as pool:
+        coming = pool.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = pool.submit(next, items, None)
+            yield item
 
 
 def stream_of(cloud: PointCloud | CloudStream) -> CloudStream:

@@ -18,6 +18,7 @@ import numpy as np
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.stream import CHUNK
 
+MOST_COLUMNS = 10_000  # of a point; each costs time, whether or not it holds anything
 LONGEST_LINE = 1 << 20  # characters: a point has some hundred at most
 BLOCK = 1 << 22  # characters read at a time
 ROWS = CHUNK // 4  # lines parsed at a time: each is a Python object until it is parsed
@@ -40,7 +41,7 @@ GZIP_RATIO, GZIP_LEAST = 25, 10_000_000
 
 @contextmanager
 def open_text(path: Path) -> Iterator[TextIO]:
-    """A text file as str, its line ends as \\n: UTF-8 or UTF-16, with or without a mark, gzip by its first bytes."""
+    """A text file as str, with Unix line ends: UTF-8 or UTF-16, with or without a mark, gzip by its first bytes."""
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
@@ -129,6 +130,8 @@ class Lines:
 
 @dataclass
 class Rows:
+    """Lines of a table that hold points."""
+
     lines: list[str] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)  # of the lines in the file, from 1
 
@@ -150,8 +153,7 @@ class Dialect:
     def tidy(self, line: str) -> str:
         """The line as numpy's reader takes it."""
         if self.trailing:
-            line = line.rstrip()
-            line = line.removesuffix(self.delimiter or "")
+            line = line.rstrip(" \r\n").removesuffix(self.delimiter or "")
         return line.replace(",", ".") if self.decimal_comma else line
 
     def cells(self, line: str) -> list[str]:

@@ -20,16 +20,16 @@ from fmr_cli.io.fields import (
     fields_of,
     lost_context,
     refuse_degrees,
+    refuse_poses,
     to_cloud,
     unique,
 )
 from fmr_cli.io.stream import COLORS, CloudStream, Wanted
-from fmr_cli.io.table import COMMENTS, ROWS, THOUSANDS, Dialect, Lines, Rows, number_in, open_text, parse
+from fmr_cli.io.table import COMMENTS, MOST_COLUMNS, ROWS, THOUSANDS, Dialect, Lines, Rows, number_in, open_text, parse
 
 HEAD = 200  # lines that are looked at to tell how the file is written
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 PTS = ("intensity", *COLORS)  # what a PTS line may hold after x y z, in that order
-MOST_COLUMNS = 10_000
 PREAMBLE = 30  # lines before the names, at most
 SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
@@ -65,6 +65,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
                 cloud = to_cloud({name: values[name] for name in names}, wanted.attributes)
             else:
                 matrix = values.view(np.float64).reshape(len(values), len(names))
+                if done == len(values):
+                    refuse_poses(matrix)
                 bare = bare_names(matrix[:, 3:]) if bare is None else bare
                 cloud = bare_cloud(matrix, bare, wanted.attributes)
             cloud.left_out = table.left_out
@@ -114,6 +116,9 @@ def find_table(head: Rows) -> Table:
     if not head.lines:
         raise CloudFileError("holds no points")
     dialect = find_dialect(head)
+    if dialect.trailing and len(named) == dialect.columns + 1 and named[-1]:  # a last column that is empty so far
+        dialect.trailing, dialect.columns = False, len(named)
+        dialect.used = list(range(dialect.columns))
     for comment in comments if not named else []:
         words = names_in(comment)
         refuse_degrees(words)
@@ -192,7 +197,7 @@ def find_dialect(head: Rows) -> Dialect:
         )
     if delimiter == "," and (comma or decimals_between_commas(lines)):
         raise CloudFileError("has commas both as decimals and between the columns: export it with semicolons or points")
-    trailing = delimiter is not None and all(line.rstrip().endswith(delimiter) for line in lines)
+    trailing = delimiter is not None and all(line.rstrip(" \r\n").endswith(delimiter) for line in lines)
     dialect = Dialect(0, [], delimiter, comma, quoted, trailing)
     widths = [len(dialect.cells(line)) for line in lines]
     dialect.columns = max(set(widths), key=lambda width: (widths.count(width), width))

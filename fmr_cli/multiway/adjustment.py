@@ -139,7 +139,7 @@ def factor_of(survey: Survey, link: Link) -> Factor:
 def anchor_of(survey: Survey, component: Component, used: list[Link]) -> int:
     """The scan that is asked for, else the one with most links, the first of equals."""
     if survey.anchor in component.T_component_scan:
-        return survey.anchor  # type: ignore[return-value]
+        return survey.anchor
     count = {n: sum(n in link.ends for link in used) for n in sorted(component.T_component_scan)}
     return max(count, key=lambda n: (count[n], -n))
 

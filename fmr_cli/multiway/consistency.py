@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -210,7 +211,7 @@ def meeting(
     return [(i, j, T) for near, i, j, T in sorted(pairs, key=lambda p: p[:3])[:MET] if near < 1]
 
 
-def rekeyed(table: dict[tuple[int, int], list], gone: int, keep: int) -> None:
+def rekeyed(table: dict[tuple[int, int], list[Any]], gone: int, keep: int) -> None:
     """Moves what lies between ``gone`` and others to ``keep``."""
     for key in [k for k in table if gone in k]:
         other = key[0] if key[1] == gone else key[1]

@@ -1,4 +1,4 @@
-"""A cheap look at two scans: do their local features agree on a pose, and does one lie on the other there?
+"""A cheap look at two scans: whether their local features agree on a pose, and one lies on the other there.
 
 The one place where multiway opens up what ``registration`` prepares: keypoints, descriptors and voxel surfaces of a
 scan, on a grid that scans of like size share, so that each scan is described once and not once for each pair.

@@ -57,7 +57,7 @@ def register(store: Store, task: Attempt) -> Link:
     source, target, start = task.source, task.target, task.start
     try:
         a, b = store.prepared(source), store.prepared(target)
-        found = align(a, b, task.options, threads=1)
+        found = align(a, b, task.options, threads=1, hints=False)
         poses = [(found.T_target_source, found.confidence)]
         poses += [(np.array(x["T_target_source"]), x["confidence"]) for x in found.alternatives]
         hypotheses = [Hypothesis(enter_frames(T, a.frame, b.frame), float(c)) for T, c in poses]

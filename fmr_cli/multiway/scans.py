@@ -11,6 +11,7 @@ from fmr_cli.batch.manifest import numbered, safe
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.io import check_scan, holds_scans, scan_paths
+from fmr_cli.io.addresses import address_of, located
 from fmr_cli.io.files import check_readable
 from fmr_cli.io.folders import find_scans, natural
 from fmr_cli.io.parts import label_of
@@ -70,15 +71,16 @@ def is_list(path: Path) -> bool:
         return False
     with path.open(encoding="utf-8", errors="replace") as file:
         line = next((text for text in file if text.strip() and not text.lstrip().startswith("#")), "")
-    return (path.parent / line.split("#")[0].strip()).is_file()
+    name = line.split("#")[0].strip()
+    return address_of(name) is not None or (path.parent / name).is_file()
 
 
 def in_list(path: Path) -> list[Path]:
     """The files that a text file names, one a line, relative to it; # begins a comment. Raises CloudFileError."""
     check_readable(path)
     lines = (line.split("#")[0].strip() for line in path.read_text("utf-8", errors="replace").splitlines())
-    files = [path.parent / line for line in lines if line]
-    missing = next((file for file in files if not file.is_file()), None)
+    files = [located(path.parent, line) for line in lines if line]
+    missing = next((file for file in files if not address_of(file) and not file.is_file()), None)
     if missing or not files:
         what = f"lists {missing}, which is not there" if missing else "lists no scans"
         raise CloudFileError(f"{path}: {what}; name one scan file a line")

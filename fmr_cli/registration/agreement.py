@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.corner import share_beyond_corner
 from fmr_cli.geometry.point_to_plane import FACING, point_to_plane
 from fmr_cli.geometry.surface import Surface
 
@@ -36,6 +37,8 @@ class Agreement:
     offset: how far these lie off each other's tangent planes, root mean square, over how far a surface's own
         neighbours do. turn: the mean of 1 - |cosine| between their normals, over the same. Both are about 1 or less
         where the scans are samples of one surface, whatever its curvature and noise.
+    detail: points, of both, that are explained and lie on none of the three planes of their largest corner: what a
+        mere corner, which fits any other, lacks.
     stretch: by how much the source would have to grow or shrink to fit better, as a share, beyond what chance explains.
     """
 
@@ -46,12 +49,13 @@ class Agreement:
     inlier_rmse: float
     offset: float
     turn: float
+    detail: int
     stretch: float
 
 
 def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> Agreement:
     """Compare two surfaces on the same voxel edge at a pose between their frames."""
-    shares, explained_shares, sums = [], [], np.zeros(8)
+    shares, explained_shares, sums, detail = [], [], np.zeros(8), 0.0
     for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
         moved = transform_points(T, a.points)
         distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
@@ -72,6 +76,8 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
             explained.sum(), contradicted.sum(), touching.sum(), (d[touching] ** 2).sum(), (off[touching] ** 2).sum(),
             (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
         ]  # fmt: skip
+        common, rng = here[explained], np.random.default_rng(0)
+        detail += len(common) * share_beyond_corner(moved[common], n[explained], b.edge, rng)
         shares.append(touching.sum() / max(a.solid.sum(), 1))
         explained_shares.append(explained.sum() / max(a.solid.sum(), 1))
     square, off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
@@ -83,6 +89,7 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
         inlier_rmse=float(np.sqrt(square)) * target.edge if sums[2] else float("inf"),
         offset=float(np.sqrt((off2 + FLOOR**2) / (own_off2 + FLOOR**2))),
         turn=float((max(turns, 0) + FLOOR) / (own_turns + FLOOR)),
+        detail=round(detail),
         stretch=stretch(source, target, T_target_source),
     )
 

@@ -12,13 +12,8 @@ on made-up scans that no test uses.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cache
-from importlib.resources import files
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -27,21 +22,26 @@ from fmr_cli.geometry.observability import direction
 from fmr_cli.registration.agreement import Agreement, agreement
 from fmr_cli.registration.models import model
 from fmr_cli.registration.pair import Pair
+from fmr_cli.registration.verdict_weights import Weights
 
 ALIGNED = 0.7  # confidence from which a pose is called aligned
 MOST_STRETCH = 0.05  # a stretch beyond it is as bad
-# Of 797 right poses of made-up pairs, bent ones too, none had a stretch beyond; so few pairs of another scale are among
-# those that the weights were fitted to that much other evidence could outweigh it.
-OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch, and the confidence that it leaves at most
+# What no other evidence outweighs, and the confidence that it leaves at most; by the looks at 640 made-up pairs, bent
+# ones too (`python -m benchmarks.calibrate` counts them). Such pairs are too few for the weights to say so themselves.
+OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: none of 892 right poses had that
+DENIED = 0.1  # more contradicted than explained: 1 of 56 poses that stood first was right
+# Fewer points of detail than that, hardly more than a corner, which fits any other: 9 of 95 were right.
+BARE, IF_BARE = 5, 0.3
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
 RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be right
 MARGIN = (-3.0, 6.0)  # of the margins over rivals: beyond, they say no more; the upper one also where there is no rival
 DEVIATIONS = 3.0  # of what the fit has seen: beyond, products of evidence would run away
 # From where on a kind of evidence is worth a word; they explain a verdict and do not make it.
-CONTRADICTED, STRETCHED, ROUGH, SMALL, FEW = 0.1, 0.005, 1.8, 0.2, 12
+CONTRADICTED, STRETCHED, ROUGH, SMALL, FEW, PLAIN = 0.1, 0.005, 1.8, 0.2, 12, 20
 QUALITY = slice(2, 5)  # of ``Evidence.vector``: what ``Evidence.quality`` gives
-STRETCH = 7  # of ``Evidence.vector``: the stretch, in negative hundredths
+# Of ``Evidence.vector``: explained over contradicted, a logarithm; the stretch, in negative hundredths; ``detail_log``.
+CONTRADICTION, STRETCH, DETAIL = 4, 7, 9
 TURNED = 5.0  # degrees: rivals turned by less are told by their shift
 
 
@@ -70,44 +70,13 @@ class Evidence(Agreement):
         """What the logistic model sees, after a 1 for the intercept: of each kind of evidence, more is better."""
         share, points = max(self.explained_share, 1e-2), (self.explained + 10) / 400
         against = -100 * min(self.stretch, MOST_STRETCH)
-        return np.array(
-            [1.0, np.log1p(self.votes), *self.quality(), np.log(share), np.log(points), against, -self.repeats]
-        )
+        votes, share, points = np.log([1 + self.votes, share, points])
+        return np.array([1.0, votes, *self.quality(), share, points, against, -self.repeats, detail_log(self.detail)])
 
 
-@dataclass(frozen=True)
-class Weights:
-    """What the fit gives. support: (d,) of ``Evidence.vector``; fit: (q,) of ``Evidence.quality``.
-
-    mean, std: (s,) of ``standing`` where it was fitted; verdict: (1 + s + s (s + 1) / 2,) of its ``products``.
-    """
-
-    support: np.ndarray
-    fit: np.ndarray
-    mean: np.ndarray
-    std: np.ndarray
-    verdict: np.ndarray
-
-
-@cache
-def bundled_weights() -> Weights:
-    """Those of ``models/verdict.json``."""
-    return as_weights(json.loads((files("fmr_cli.models") / "verdict.json").read_text("utf-8")))
-
-
-def as_weights(given: Mapping[str, Any]) -> Weights:
-    """Those of a JSON object. Raises KeyError where it lacks some."""
-    return Weights(**{f.name: np.array(given[f.name]) for f in fields(Weights)})
-
-
-def weights_of(path: Path | None) -> Weights:
-    """Those that a model brings along, else the bundled ones; also where its own are of another version's evidence."""
-    given, bundled = model(path).verdict, bundled_weights()
-    own = None if given is None or not {f.name for f in fields(Weights)} <= given.keys() else as_weights(given)
-    same = own is not None and all(
-        getattr(own, f.name).shape == getattr(bundled, f.name).shape for f in fields(Weights)
-    )
-    return own if own is not None and same else bundled
+def detail_log(detail: float) -> float:
+    """Points of detail as evidence: their logarithm, against 200 of them."""
+    return float(np.log((detail + 5) / 200))
 
 
 def sigmoid(logit: np.ndarray) -> np.ndarray:
@@ -121,8 +90,10 @@ def support(x: np.ndarray, weights: Weights) -> np.ndarray:
 
 
 def standing(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """Of distinct poses of one pair, x (n, d) their evidence: what each weighs among the others (n,), the best 1 or
-    less, and how the first of them stands (s,): its evidence, its margins over the others, its support as a logit.
+    """What each of several distinct poses of one pair weighs among the others, and how the first of them stands.
+
+    x: (n, d) their evidence. Weights (n,), the best 1 or less; standing (s,): the first one's evidence, its margins
+    over the others, its support as a logit.
     """
     supports, fits = support(x, weights), x[:, QUALITY] @ weights.fit
     weigh = supports * np.exp(np.clip(fits - fits.max(), -SURE_LOGIT, 0.0))
@@ -141,18 +112,28 @@ def products(standings: np.ndarray, weights: Weights) -> np.ndarray:
 
 
 def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """The probability of each of several distinct poses, x (n, d) their evidence, of which at most one is right; and
-    what each weighs among the others. The first has what the verdict gives it, the others share the rest.
+    """The probability of each of several distinct poses, of which at most one is right; what each weighs among them.
+
+    x: (n, d) their evidence. The first has what the verdict gives it, the others share the rest.
     """
     weigh, first = standing(x, weights)
     p = float(sigmoid(products(first[None], weights)[0] @ weights.verdict))
     best = int(weigh.argmax())
-    if -x[best, STRETCH] > 100 * OTHER_SCALE:
-        p = min(p, IN_OTHER_SCALE)
+    p = min(p, most(x[best]))
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
     shares[best] = p
     return shares, weigh
+
+
+def most(x: np.ndarray) -> float:
+    """The confidence that evidence x (d,) allows at most, whatever the weights say."""
+    bounds = [
+        (-x[STRETCH] > 100 * OTHER_SCALE, IN_OTHER_SCALE),
+        (x[CONTRADICTION] < 0, DENIED),
+        (x[DETAIL] < detail_log(BARE), IF_BARE),
+    ]
+    return min([p for holds, p in bounds if holds], default=1.0)
 
 
 @dataclass
@@ -185,7 +166,7 @@ class Judge:
     weights: Weights = field(init=False)
 
     def __post_init__(self) -> None:
-        self.weights = weights_of(self.pair.options.model)
+        self.weights = model(self.pair.options.model).verdict
 
     def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:
         """Gather the evidence at a pose, and weigh all candidates anew."""
@@ -256,6 +237,8 @@ def doubts(pair: Pair, best: Candidate, rivals: Sequence[Candidate]) -> list[str
         said.append(f"fits better with the source scaled by {e.stretch:.1%}: is one of the two in another scale?")
     if e.offset > ROUGH:
         said.append(f"the surfaces lie {e.offset:.1f} times as far apart as their own roughness explains")
+    if e.detail < PLAIN:
+        said.append("what both scans share is hardly more than three planes, a corner that fits any other")
     if e.explained_share < SMALL:
         said.append(f"only {e.explained_share:.0%} of the smaller scan lies on the other one")
     if e.votes < FEW:

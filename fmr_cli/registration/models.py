@@ -10,13 +10,15 @@ from dataclasses import replace
 from functools import cached_property, lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.errors import ModelError
 from fmr_cli.feature_metric.numpy_solver import NumpySolver
 from fmr_cli.feature_metric.search import Solver
 from fmr_cli.io.weights import Weights, read_weights
+from fmr_cli.registration.verdict_weights import Weights as VerdictWeights
+from fmr_cli.registration.verdict_weights import usable
 
 if TYPE_CHECKING:
     import torch
@@ -63,10 +65,10 @@ class Model:
                 f"{self.name}: the weights do not fit the local encoder ({error}); use one written by `fmr train`"
             ) from None
 
-    @property
-    def verdict(self) -> dict[str, Any] | None:
-        """The file's own calibration of the verdict, or None."""
-        return self.weights.verdict
+    @cached_property
+    def verdict(self) -> VerdictWeights:
+        """The weights of the verdict's evidence: the file's own, or the bundled ones."""
+        return usable(self.weights.verdict)
 
     def on(self, device: Device) -> Encoder:
         """The encoder of whole clouds as torch has it."""

@@ -81,12 +81,12 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def choices(f: Field) -> tuple[str, ...]:
+def choices(f: Field[Any]) -> tuple[str, ...]:
     """The words that an option may be; none for a number, a switch or a file."""
     return STARTS if f.name == "init" else get_args(f.type) if get_args(f.type)[:1] == (f.default,) else ()
 
 
-def checked(f: Field, value: Any) -> Any:
+def checked(f: Field[Any], value: Any) -> Any:
     """The value of one option, as its plain Python type. Raises OptionsError."""
     said = f"{flag(f.name)} {value!r}"
     if f.name == "up":

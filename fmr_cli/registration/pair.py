@@ -101,7 +101,7 @@ class Pair:
         return Q, P
 
     @cached_property
-    def template(self) -> Template:
+    def template(self) -> Template[np.ndarray]:
         """The global feature F(P) of the target, and its Jacobian."""
         return self.encoder.template(self.sampled[1], self.threads)
 

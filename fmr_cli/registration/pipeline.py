@@ -18,8 +18,8 @@ from threadpoolctl import ThreadpoolController
 
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration import hypotheses, mirror, refinement
-from fmr_cli.registration.confidence import LIKELY, Judge
+from fmr_cli.registration import hypotheses, mirror, places, refinement
+from fmr_cli.registration.confidence import ALIGNED, LIKELY, Judge
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -31,6 +31,8 @@ REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
 FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
+PLACES, APART = 4, 10.0  # of a map whose poses are judged, and voxel edges that they lie apart
+CLOSER = 2  # of them that are looked at closer, the second one where the first one was not the place
 FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000))  # the looks after it, while none is sure
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 CHECKS = 5  # iterations of the IC solver from the pose found, where asked for
@@ -50,6 +52,7 @@ def align(
     options: Options = Options(),
     threads: int = 2,
     check: bool = False,
+    hints: bool = True,
 ) -> Registration:
     """Register source onto target: find T_target_source with x_target = R x_source + t.
 
@@ -58,12 +61,17 @@ def align(
 
     threads: 2 for what concerns one cloud alone to be done for both side by side, 1 where pairs run side by side
     already. The answer is the same bit for bit, whatever their number and the machine's. check: also let the paper's IC
-    solver go on from the pose found, see ``Registration.feature_check``. Raises RegistrationError
-    where a cloud cannot be registered at all, ModelError for the model or the device, FmrError for options that
-    contradict each other.
+    solver go on from the pose found, see ``Registration.feature_check``. hints: where the pair is not ``aligned``, also
+    take a quick look whether the source's mirror image fits, and warn; False where many pairs are tried that need not
+    fit. Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or the device,
+    FmrError for options that contradict each other.
     """
     found = as_they_are(source, target, options, threads, check)
-    if not options.allow_mirror or found.status == "aligned":
+    if found.status == "aligned":
+        return found
+    if not options.allow_mirror:
+        fits = mirror_fits(source, target, options) if hints else None
+        found.warnings += [] if fits is None else [mirror.HINT.format(fits)]
         return found
     image = mirror.image(source, options.seed)
     other = as_they_are(image, target, options, threads, check)
@@ -95,13 +103,15 @@ def as_they_are(
                 lambda x: x if isinstance(x, Prepared) else prepare(x, options.seed), (source, target)
             )
         check_systems(source, target)
-        verdicts = [
-            (factor, look(source if factor == 1.0 else source.scaled(factor), target, given, threads, time))
-            for factor, given in scales(source, target, options)
-        ]
+        verdicts: list[tuple[float, Judge]] = []
+        for factor, given in scales(source, target, options):
+            scaled = source if factor == 1.0 else source.scaled(factor)
+            verdicts.append((factor, look(scaled, target, given, threads, time)))
+            if verdicts[-1][1].sure(SURE):
+                break
         factor, judge = max(verdicts, key=lambda verdict: verdict[1].best.confidence)
         best = judge.best
-        if options.refine and not options.scale:
+        if options.refine:
             with time.stage("polish"):
                 T = refinement.by_geometry(judge.pair, best.T_target_source)
                 best = replace(best, T_target_source=refinement.exact(judge.pair, T))
@@ -122,8 +132,57 @@ def as_they_are(
 
 
 def look(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge:
-    """The poses that were found, weighed against each other; looks get dearer while none is sure."""
-    if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None and not options.scale:
+    """The poses that were found, weighed against each other: in a map part by part, else in all of the target."""
+    judge = in_places(source, target, options, threads, time) if places.is_map(source, target, options) else None
+    if judge and judge.sure(LIKELY):
+        return judge
+    whole = at_once(source, target, options, threads, time)
+    return judge if judge and judge.sure(whole.best.confidence) else whole
+
+
+def in_places(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge | None:
+    """What is found in the parts of a map where a glance finds most; None where it has no such parts.
+
+    The best pose is right if it is right in its part, and none of those found elsewhere is.
+    """
+    glances: list[tuple[Pair, list[Hypothesis]]] = []
+    for part in places.parts(source, target, options):
+        with suppress(RegistrationError):
+            pair = make_pair(source, part, options, threads, *FIRST)
+            found = [h for h in features(pair, time) if pair.allowed(h.T_target_source)]
+            if found:
+                glances.append((pair, sorted(found, key=lambda h: -h.score)))
+    looked: list[np.ndarray] = []  # where the source's centre came to lie
+    judges: list[Judge] = []
+    for pair, found in sorted(glances, key=lambda glance: -glance[1][0].score):
+        at = transform_points(pair.leave_centred(found[0].T_target_source), source.centre[None])
+        if len(judges) < PLACES and all(np.linalg.norm(at - other) > APART * pair.edge for other in looked):
+            looked.append(at)
+            judges.append(Judge(pair))
+            consider(judges[-1], found, time)
+    judges = sorted((j for j in judges if j.candidates), key=lambda j: -j.best.confidence)
+    for number, judge in enumerate(judges[:CLOSER]):
+        if not judge.sure(SURE):
+            judges[number] = further(source, judge.pair.target, options, threads, time)
+        if judges[number].sure(ALIGNED):
+            break
+    if not judges:
+        return None
+    judge, *others = sorted(judges, key=lambda j: -j.best.confidence)
+    pair, best = judge.pair, judge.best
+    elsewhere = [
+        replace(j.best, T_target_source=pair.enter_centred(j.pair.leave_centred(j.best.T_target_source)))
+        for j in others
+    ]
+    elsewhere = [c for c in elsewhere if not pair.same(c.T_target_source, best.T_target_source)]
+    alone = float(np.prod([1 - c.confidence for c in elsewhere]))
+    judge.candidates = [replace(best, confidence=best.confidence * alone), *elsewhere, *judge.candidates[1:]]
+    return judge
+
+
+def at_once(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge:
+    """Looks at all of the target, dearer ones while none is sure."""
+    if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None:
         with suppress(RegistrationError):  # too few voxels of that size
             judge = Judge(make_pair(source, target, options, threads, *FIRST))
             consider(judge, features(judge.pair, time), time)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
@@ -58,14 +60,26 @@ class Prepared:
                 "by `fmr transform FILE --crs EPSG:... -o OUT` say"
             )
         self.plane = plane_of(points)
-        self.points = points if self.plane is None else raised(points, self.plane, rng)
-        self.edge, self.spacing = working_scale(self.points, rng)
+        self._hold(points if self.plane is None else raised(points, self.plane, rng), rng)
+
+    def _hold(self, points: np.ndarray, rng: np.random.Generator) -> None:
+        """Points (N, 3), centred, and their scales; nothing is known of them yet."""
+        self.points = points
+        self.edge, self.spacing = working_scale(points, rng)
         self._surfaces, self._described, self._fine, self._gicp, self._roughness = (Memo(KEPT) for _ in range(5))
 
     @property
     def centre(self) -> np.ndarray:
         """(3,) where the centred coordinates have their origin, file's coordinates."""
         return self.frame.origin
+
+    def part(self, inside: np.ndarray) -> Prepared:
+        """The points ``inside`` (N,) alone, in a centred frame of their own; what is said of the cloud stays."""
+        part = copy(self)
+        points = self.points[inside]
+        part.frame = Frame(self.frame.origin + points.mean(0))
+        part._hold(points - points.mean(0), np.random.default_rng(self.seed))
+        return part
 
     def scaled(self, factor: float) -> Prepared:
         """The same cloud with every length multiplied by ``factor``."""

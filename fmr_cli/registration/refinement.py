@@ -13,7 +13,7 @@ from fmr_cli.feature_metric.inverse_compositional import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
 from fmr_cli.geometry.gicp import GicpCloud, gicp
 from fmr_cli.geometry.planar import within_plane
-from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_plane, step_motion
+from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_plane, step_motion, with_scale
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.se3 import exp
 from fmr_cli.geometry.smoothing import local_planes
@@ -46,11 +46,13 @@ def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
         T = by_patches(pair, T, LEVELS)
     if not pair.options.refine:
         return T if hypothesis.errors else by_patches(pair, T, FINE)
-    return by_geometry(pair, T) if pair.options.scale else by_planes(pair, T)
+    return by_planes(pair, T)
 
 
-def by_patches(pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """The pose after the feature metric of local patches, from coarse to fine."""
+def by_patches(
+    pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[float, float], ...], both: bool = False
+) -> np.ndarray:
+    """The pose after the feature metric of local patches, from coarse to fine; by one Jacobian or ``both``."""
     length = pair.boxes[1].unit
     g = T_target_source.copy()
     g[:3, 3] /= length
@@ -60,7 +62,7 @@ def by_patches(pair: Pair, T_target_source: np.ndarray, levels: tuple[tuple[floa
         centres = patch_centres(pair, s, t, g, reach) / length
         template = patch_template(pair.encoder.layers, centres, balls(t, reach, length), reach / length)
         look = balls(s, reach, length)
-        g = refine(pair.encoder.layers, template, look, g, PATCH_ITERATIONS, pair.motion.basis()).g
+        g = refine(pair.encoder.layers, template, look, g, PATCH_ITERATIONS, pair.motion.basis(), both).g
     g[:3, 3] *= length
     return g
 
@@ -88,7 +90,9 @@ def by_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     Only points of the common region, and partners that face along, so that at small overlap what only one scan saw
     does not pull the pose away.
     """
-    basis, T, pivot = pair.motion.basis(), T_target_source, np.zeros(3)
+    scale = pair.options.scale
+    basis, T, pivot = with_scale(pair.motion.basis(), scale), T_target_source, np.zeros(3)
+    free = len(basis)
     for number, reach in enumerate(PLANE_REACHES):
         if number % CHOSEN_ANEW == 0:
             points, facing = common_points(pair, T)
@@ -96,8 +100,9 @@ def by_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
         normal = point_to_plane(points, pair.t.points, pair.t.normals, pair.t.tree, T, reach, pivot, facing)
         if normal.count < MIN_POINTS:
             return T
-        step = constrained_step(normal.A[:6, :6] + DAMPING * np.diag(np.diag(normal.A)[:6]), -normal.b[:6], basis)
-        T = exp(step) @ T
+        A, b = normal.A[:free, :free], normal.b[:free]
+        step = constrained_step(A + DAMPING * np.diag(np.diag(A)), -b, basis)
+        T = (step_motion(step) if scale else exp(step)) @ T
     return T
 
 
@@ -165,7 +170,8 @@ def exact(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     scans a finer one.
     """
     source, target, T = pair.source, pair.target, T_target_source
-    if pair.motion.dof != "rigid" or len(target.points) <= GICP_TARGET or pair.flat_planes is not None or noisy(pair):
+    other_motion = pair.options.scale or pair.motion.dof != "rigid"
+    if other_motion or len(target.points) <= GICP_TARGET or pair.flat_planes is not None or noisy(pair):
         return T  # what the step before did for these, GICP would undo
     if len(target.points) <= 4 * EXACT_TARGET and in_common(pair, T):
         some = sample(source.points, GICP_SOURCE, np.random.default_rng(pair.seed))

@@ -97,7 +97,8 @@ def describe(
     T[:3, :3] *= factor
     certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3))
     rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
-    weak = observability.undetermined(certain.information, pair.boxes[1].unit / 2, in_use(pair))
+    centre, extent = smaller(pair, best.T_target_source)
+    weak = observability.undetermined(observability.about(certain.information, centre), extent, in_use(pair))
     aligned = best.confidence >= ALIGNED and not weak
     reasons = [f"the scans do not determine: {'; '.join(weak)}"] if weak else []
     alternatives = [
@@ -133,6 +134,18 @@ def describe(
         options=options,
         reasons=[] if aligned else [*reasons, *doubts(pair, best, rivals)],
     )
+
+
+def smaller(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,), in the target's centred frame, and half extent of the cloud that reaches less far.
+
+    What a turn does is seen there: about the far centre of a map, a scan's turn is hardly told from its shift.
+    """
+    centres = pair.s.points.mean(0), pair.t.points.mean(0)
+    extents = [float(np.abs(x.points - c).max()) for x, c in zip((pair.s, pair.t), centres, strict=True)]
+    if extents[0] < extents[1]:
+        return transform_points(T_target_source, centres[0][None])[0], extents[0]
+    return centres[1], extents[1]
 
 
 def in_use(pair: Pair) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The report of one pair, ``fmr align --report``: is the pose right, and why does the tool think so?"""
+"""The report of one pair, ``fmr align --report``: whether the pose is right, and why the tool thinks so."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ NOISE = 1.4826  # standard deviations of a normal distribution in a median absol
 
 @dataclass(frozen=True)
 class Residuals:
-    """Of moved points against the target. point: to the nearest point; plane: to the plane through
-    that point's neighbours; both (N,)."""
+    """Of moved points against the target.
+
+    point: to the nearest point; plane: to the plane through that point's neighbours; both (N,).
+    """
 
     point: np.ndarray
     plane: np.ndarray

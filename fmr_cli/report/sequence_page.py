@@ -128,8 +128,10 @@ def table_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def frames_to_look_at(rows: Sequence[dict[str, Any]], T_first_scan: np.ndarray, read: Read) -> list[dict[str, Any]]:
-    """The uncertain frames, an even choice of them where they are many, else those of the largest residuals; each with
-    its picture against the frames before it."""
+    """The uncertain frames, else those of the largest residuals, each with its picture against the frames before it.
+
+    An even choice of the uncertain ones where they are many.
+    """
     uncertain = [n for n, row in enumerate(rows) if row["status"] != "aligned"]
     by_residual = sorted(range(1, len(rows)), key=lambda n: -(rows[n].get("inlier_rmse") or 0.0))
     some = uncertain or by_residual[: LOOK_AT // 3]

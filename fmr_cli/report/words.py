@@ -29,6 +29,7 @@ ADVICE = (
      "noisy."),
     ("of the smaller scan lies on", "There is little that both scans saw. A scan taken in between gives two sure "
      "links."),
+    ("three planes", "Scan so that both see something besides walls: furniture, pipes, a marker."),
     ("matches of local features", "Few places look alike in both scans: little overlap, few points, or another "
      "place."),
     ("voxel", "Check that both files are in one unit and show one place."),
@@ -41,6 +42,7 @@ EVIDENCE = {
     "inlier_rmse": ("RMSE", "of points near the other scan"),
     "offset": ("offset", "distance between the surfaces over their own roughness; about 1 is as good as can be"),
     "turn": ("turn", "angle between the surfaces over their own unevenness; about 1 is as good as can be"),
+    "detail": ("detail", "points explained that lie on none of the three planes of the largest corner"),
     "stretch": ("stretch", "share by which the source would have to grow or shrink to fit better"),
     "votes": ("matching features", "local features that agree with the pose"),
     "repeats": ("repetition", "how much of the scene looks the same elsewhere"),

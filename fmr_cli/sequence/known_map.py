@@ -54,7 +54,7 @@ class KnownMap:
         """T_map_scan (4, 4) by ``align``, or None where its verdict is not "aligned"; and why."""
         from fmr_cli.registration import align
 
-        found = align(scan.for_align, self.for_align, pair)
+        found = align(scan.for_align, self.for_align, pair, hints=False)
         if found.status != "aligned":
             return None, "; ".join(found.reasons) or f"confidence {found.confidence:.2f}"
         return found.T_target_source, ""

@@ -152,7 +152,7 @@ def verify(
     from fmr_cli.registration import align
 
     scan = load(keys[later])
-    found = align(scan.for_align, load(keys[earlier]).for_align, pair)
+    found = align(scan.for_align, load(keys[earlier]).for_align, pair, hints=False)
     if found.status != "aligned":
         return None
     T_earlier_map = np.linalg.inv(poses[keys[earlier]])

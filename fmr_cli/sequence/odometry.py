@@ -191,7 +191,7 @@ class Odometry:
         from fmr_cli.registration import align
 
         _, last, T_map_last = self.last
-        found = align(scan.for_align, last.for_align, replace(self.pair, init="features"))
+        found = align(scan.for_align, last.for_align, replace(self.pair, init="features"), hints=False)
         return found, T_map_last @ found.T_target_source
 
     def _fits(self, fit: Fit) -> bool:

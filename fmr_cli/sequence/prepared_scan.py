@@ -152,8 +152,9 @@ def choose_voxel(points: np.ndarray, wish: float | None = None, others: Iterable
 
 
 def suitable_voxel(points: np.ndarray) -> float:
-    """The finest edge that leaves WORKING_POINTS of the points (N, 3) at most, POINTS_PER_VOXEL in each on average, and
-    voxels that hold a surface (HELD) rather than noise (NOISE). Raises RegistrationError.
+    """The finest edge for points (N, 3) whose voxels hold a surface (HELD) rather than noise (NOISE).
+
+    It leaves WORKING_POINTS at most, and POINTS_PER_VOXEL in each on average. Raises RegistrationError.
     """
     wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
@@ -175,8 +176,10 @@ def suitable_voxel(points: np.ndarray) -> float:
 
 
 def grain(points: np.ndarray) -> tuple[float, float]:
-    """Of points (N, 3) in voxels, thinned to one a voxel: the median distance to the tenth neighbour, and how far the
-    flattest quarter of the neighbourhoods strays from its planes (standard deviation), lines left out.
+    """How far apart points (N, 3) in voxels are once thinned to one a voxel, and how noisy; in voxels.
+
+    The median distance to the tenth neighbour; and how far the flattest quarter of the neighbourhoods strays from its
+    planes (standard deviation), lines left out.
     """
     thinned = small_gicp.voxelgrid_sampling(points, 1.0)
     if thinned.size() <= NEIGHBOURS:

@@ -34,7 +34,7 @@ class SequenceResult:
 
     @property
     def status(self) -> str:
-        """ "aligned" where every frame is."""
+        """Says "aligned" where every frame is."""
         return "uncertain" if self.uncertain else "aligned"
 
     @property

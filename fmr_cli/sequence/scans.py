@@ -89,11 +89,10 @@ def as_scans(scans: Scans | str | Path | Iterable[str | Path | PointCloud]) -> S
 def find_scans(
     path: Path, start: int = 0, stop: int | None = None, step: int = 1, outputs: Iterable[Path] = ()
 ) -> Scans:
-    """The scans of a folder, of a KITTI odometry sequence, of a KITTI raw drive, of a bag (or another file that holds
-    several), or of a text file that lists them.
+    """The scans of a folder, a KITTI sequence or raw drive, a bag, or a text file that lists them.
 
-    start, stop, step: as in a slice, counted over all scans. outputs: files that are no scans, wherever they lie.
-    Raises CloudFileError where there are fewer than two.
+    Of any other file that holds several, too. start, stop, step: as in a slice, counted over all scans. outputs: files
+    that are no scans, wherever they lie. Raises CloudFileError where there are fewer than two.
     """
     notes: list[str] = []
     home = path

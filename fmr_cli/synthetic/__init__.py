@@ -1,0 +1,1 @@
+"""Made-up shapes, scenes and scanners, with exact truth."""

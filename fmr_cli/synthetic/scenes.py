@@ -46,6 +46,44 @@ class Scene:
             nearest[rays] = np.minimum(nearest[rays], _HIT[kind](o, d))
         return nearest
 
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """Exact unit normals (N, 3), outward of the solid, of the surfaces that points (N, 3) lie on."""
+        nearest, found = np.full(len(points), FAR), np.zeros(points.shape)
+        for kind, A in zip(self.kinds, self.maps, strict=True):
+            inverse = np.linalg.inv(A)
+            level, slope = _LEVEL[kind](points @ inverse[:3, :3].T + inverse[:3, 3])
+            normal = slope @ inverse[:3, :3]
+            length = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+            closer = np.abs(level) / length < nearest
+            nearest[closer] = (np.abs(level) / length)[closer]
+            found[closer] = (normal / length[:, None])[closer]
+        return found
+
+
+# Of points (N, 3) in a unit solid's frame: a function that is 0 on its surface (N,), and its slope (N, 3).
+
+
+def _level_cube(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    rows, axis = np.arange(len(u)), np.abs(u).argmax(1)
+    slope = np.zeros(u.shape)
+    slope[rows, axis] = np.sign(u[rows, axis])
+    return np.abs(u)[rows, axis] - 1, slope
+
+
+def _level_ball(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    radius = np.maximum(np.linalg.norm(u, axis=1), 1e-300)
+    return radius - 1, u / radius[:, None]
+
+
+def _level_cylinder(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    radius = np.maximum(np.linalg.norm(u[:, :2], axis=1), 1e-300)
+    cap = np.abs(u[:, 2]) > radius
+    wall = np.column_stack([u[:, :2] / radius[:, None], np.zeros(len(u))])
+    return np.where(cap, np.abs(u[:, 2]), radius) - 1, np.where(cap[:, None], np.sign(u) * [0, 0, 1], wall)
+
+
+_LEVEL = {CUBE: _level_cube, BALL: _level_ball, CYLINDER: _level_cylinder}
+
 
 def _slabs(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with np.errstate(divide="ignore", invalid="ignore"):

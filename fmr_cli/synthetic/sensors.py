@@ -24,9 +24,12 @@ UNIT_AREA = {CUBE: 24.0, BALL: 4 * np.pi, 2: 6 * np.pi}
 
 @dataclass
 class Scan:
-    """points (N, 3) of surfaces, scene frame; origin (3,) of the sensor, None for several or none; stray (K, 3):
-    points that are no surface of the scene (no-returns, sky, people, the sensor's own vehicle). view (2, 3): corners of
-    the box that the scan was cut to; None where all there was to see was kept."""
+    """What a made-up sensor has seen, in the scene's frame.
+
+    points: (N, 3) of surfaces; origin: (3,) of the sensor, None for several or none; stray: (K, 3) points that are no
+    surface of the scene (no-returns, sky, people, the sensor's own vehicle); view: (2, 3) corners of the box that the
+    scan was cut to, None where all there was to see was kept.
+    """
 
     points: np.ndarray
     origin: np.ndarray | None = None

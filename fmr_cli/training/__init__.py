@@ -1,0 +1,1 @@
+"""Learning: recipes, losses, the loop, and the user's scans as material."""

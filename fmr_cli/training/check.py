@@ -22,11 +22,12 @@ from fmr_cli.evaluation.verdict_evidence import RIGHT_DEGREES, RIGHT_SHARE
 from fmr_cli.io.weights import weights_bytes
 from fmr_cli.multiway.store import Store
 from fmr_cli.registration import Options, align, prepare
-from fmr_cli.registration.confidence import ALIGNED, SURE_LOGIT, Weights, weights_of
+from fmr_cli.registration.confidence import ALIGNED, SURE_LOGIT
 from fmr_cli.registration.models import model
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.pipeline import FURTHER
 from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.verdict_weights import Weights
 from fmr_cli.training.scan_views import Overlapping
 from fmr_cli.training.self_registration import BANDS, Placed, side_by_side
 
@@ -143,7 +144,7 @@ def in_turn(pairs: list[CheckPair]) -> list[CheckPair]:
 def outcome(ends: tuple[Prepared, Prepared], truth: np.ndarray, options: Options) -> Outcome:
     """What ``align`` makes of a pair whose pose is known."""
     source, target = ends
-    found = align(source, target, options, threads=1)
+    found = align(source, target, options, threads=1, hints=False)
     points = source.frame.leave(source.points[:: max(len(source.points) // 1000, 1)])
     off = np.linalg.norm(transform_points(found.T_target_source, points) - transform_points(truth, points), axis=1)
     degrees = angle_degrees(np.linalg.inv(truth) @ found.T_target_source)
@@ -158,7 +159,7 @@ def outcome(ends: tuple[Prepared, Prepared], truth: np.ndarray, options: Options
 
 def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
     """Whether the model in ``path`` is worth keeping, and its verdict brought in line where it has to be."""
-    weights, said, replaced = weights_of(path), [], None
+    weights, said, replaced = model(path).verdict, [], None
     wrong = sum(c.before.aligned and not c.before.right for c in checked)
     if not holds([c.after for c in checked]) or wrong_ones(c.after for c in checked) > wrong:
         slope, offset = in_line([c.after for c in checked])

@@ -145,7 +145,7 @@ class Trainer:
         losses = self.task.losses(done, steps, generator)
         self.optimiser.zero_grad(set_to_none=True)
         if losses:
-            torch.stack(list(losses.values())).sum().backward()
+            torch.stack(list(losses.values())).sum().backward()  # type: ignore[no-untyped-call]
             average_gradients(learnt)
         values = {name: float(value.detach()) for name, value in losses.items()}
         norm = torch.nn.utils.clip_grad_norm_(learnt, self.task.clip)

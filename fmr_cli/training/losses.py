@@ -37,7 +37,7 @@ class Code:
     at: Tensor
 
 
-def half_precision(device: torch.device) -> AbstractContextManager:
+def half_precision(device: torch.device) -> AbstractContextManager[object]:
     """Products in bfloat16 where that is faster: a CPU without units for it takes ten times as long (measured)."""
     slow = device.type == "cpu" and not torch.backends.cpu.get_cpu_capability().startswith("AVX512")
     return nullcontext() if slow else torch.autocast(device.type, torch.bfloat16)
@@ -55,7 +55,7 @@ def critical_index(encoder: Encoder, points: Tensor) -> Tensor:
             x = torch.relu(layer(x))
         at_once = 1 if points.device.type == "cpu" else len(x)
         weight = encoder.linear[-1].weight
-        found = [torch.nn.functional.linear(c, weight).max(1).indices for c in x.split(at_once)]
+        found = [torch.nn.functional.linear(c, weight).max(1).indices for c in torch.split(x, at_once)]
     return torch.cat(found)
 
 

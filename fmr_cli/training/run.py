@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ import torch
 import fmr_cli
 from fmr_cli.errors import FmrError
 from fmr_cli.io.files import check_readable
-from fmr_cli.io.folders import find_scans
-from fmr_cli.multiway.scans import Scan, names, natural
+from fmr_cli.io.folders import find_scans, natural
+from fmr_cli.multiway.scans import Scan, names
 from fmr_cli.registration.models import Device, pick_device
 from fmr_cli.training.data import read_data
 from fmr_cli.training.global_task import GlobalTask, read_start
@@ -23,7 +24,8 @@ from fmr_cli.training.loop import Trainer
 from fmr_cli.training.processes import join_processes
 from fmr_cli.training.recipe import AnyRecipe, LocalRecipe, Recipe, ScanRecipe, read_recipe
 from fmr_cli.training.run_folder import CARD, MODEL, RECIPE, STATE, RunFolder, TrainingError
-from fmr_cli.training.scan_task import ROUNDS, ScanTask, labelled_pairs
+from fmr_cli.training.scan_material import ROUNDS, labelled_pairs
+from fmr_cli.training.scan_task import ScanTask
 from fmr_cli.training.scans import read_pairs
 from fmr_cli.training.task import Task
 
@@ -93,7 +95,7 @@ def prepare(
     elif (out / STATE).exists():
         raise TrainingError(f"{out}: holds a run already; give another --out, or --resume to go on with it")
     place = join_processes(pick_device(device))
-    task, warnings = make_task(scans, recipe, pairs, place, progress)
+    task, warnings = make_task(recipe, Given(scans, pairs, place, progress))
     folder.make()
     trainer = Trainer(task, out, minutes, resume)
     if trainer.rank == 0 and not resume:
@@ -102,37 +104,46 @@ def prepare(
     return trainer, warnings
 
 
-def make_task(
-    scans: list[Path],
-    recipe: AnyRecipe,
-    pairs: Path | None,
-    device: torch.device,
-    progress: Callable[[int, int], None],
-) -> tuple[Task, list[str]]:
+@dataclass(frozen=True)
+class Given:
+    """What a task is made from beside its recipe: scans or folders, a CSV of pairs, a device; and who hears of it."""
+
+    scans: list[Path]
+    pairs: Path | None
+    device: torch.device
+    progress: Callable[[int, int], None]
+
+
+def make_task(recipe: AnyRecipe, given: Given) -> tuple[Task, list[str]]:
     """What the recipe trains, with its material, and warnings."""
     if isinstance(recipe, ScanRecipe):
-        return scan_task(scans, recipe, pairs, device, progress)
+        return scan_task(recipe, given)
     if isinstance(recipe, Recipe):
-        start = read_start(recipe.start)
-        data, warnings = read_data(scans, recipe, pairs, device, progress)
-        if scans and not recipe.shapes + recipe.scenes:
-            warnings.append(ONLY_WHOLE)
-        return GlobalTask(recipe, data, start), warnings
-    if scans or pairs is not None:
+        return global_task(recipe, given)
+    return local_task(recipe, given), []
+
+
+def global_task(recipe: Recipe, given: Given) -> tuple[Task, list[str]]:
+    """What trains the encoder of whole clouds, and warnings."""
+    start = read_start(recipe.start)
+    data, warnings = read_data(given.scans, recipe, given.pairs, given.device, given.progress)
+    if given.scans and not recipe.shapes + recipe.scenes:
+        warnings.append(ONLY_WHOLE)
+    return GlobalTask(recipe, data, start), warnings
+
+
+def local_task(recipe: LocalRecipe, given: Given) -> Task:
+    """What trains the encoder of patches on made-up scans. Raises TrainingError where others are given."""
+    if given.scans or given.pairs is not None:
         raise TrainingError('a recipe of kind "local" learns from made-up scans alone; leave SCANS and --pairs away')
-    local_start = read_local_start(recipe.start)
-    material = make_material(recipe.pairs, recipe.patches, recipe.seed, progress)
-    return LocalTask(recipe, material, device, local_start), []
+    start = read_local_start(recipe.start)
+    material = make_material(recipe.pairs, recipe.patches, recipe.seed, given.progress)
+    return LocalTask(recipe, material, given.device, start)
 
 
-def scan_task(
-    scans: list[Path],
-    recipe: ScanRecipe,
-    pairs: Path | None,
-    device: torch.device,
-    progress: Callable[[int, int], None],
-) -> tuple[Task, list[str]]:
+def scan_task(recipe: ScanRecipe, given: Given) -> tuple[Task, list[str]]:
     """What learns from the user's scans, and warnings. Raises FmrError: no scans, a start or pairs that are none."""
+    scans, pairs = given.scans, given.pairs
     if not scans and pairs is None:
         raise FmrError(
             "nothing to train on; give scans or folders of scans (also to --resume), or a recipe with shapes"
@@ -149,11 +160,11 @@ def scan_task(
     if recipe.whole_every:
         rng = np.random.default_rng((recipe.seed, 10))
         some = [files[i] for i in np.sort(rng.permutation(len(files))[:MOST_FILES])]
-        data, warnings = read_data(some, recipe.whole, pairs, device, progress)
+        data, warnings = read_data(some, recipe.whole, pairs, given.device, given.progress)
         data.described = [f"{len(data.train)} crops for the global encoder, {len(data.held_out)} held out"]
         whole = GlobalTask(recipe.whole, data, read_start(recipe.whole.start))
     labelled = labelled_pairs(rows, listed, recipe.seed)
-    return ScanTask(recipe, listed, device, start, whole, labelled), warnings
+    return ScanTask(recipe, listed, given.device, start, whole, labelled), warnings
 
 
 def write_card(trainer: Trainer) -> None:

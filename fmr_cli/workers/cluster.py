@@ -71,7 +71,7 @@ class DaskWorkers:
         self.cluster: Any = None
 
     @property
-    def count(self) -> int:  # type: ignore[override]
+    def count(self) -> int:
         """Tasks that are worked on at a time, now."""
         return max(1, sum(self.fit.values()))
 
@@ -219,7 +219,7 @@ class DaskWorkers:
         finally:
             fetchers.shutdown(wait=False, cancel_futures=True)  # one may be waiting for a worker that keeps silent
 
-    def submit(self, function: Callable, argument: Any, to: set[str]) -> Any:
+    def submit(self, function: Callable[..., Any], argument: Any, to: set[str]) -> Any:
         """A future of function(argument) on one of these workers."""
         key = f"fmr-{uuid.uuid4().hex}"
         try:

@@ -49,7 +49,7 @@ class Handed:
     """A task that is handed out."""
 
     task: Any
-    future: Future | None = None
+    future: Future[Any] | None = None
 
 
 class Processes:
@@ -99,7 +99,7 @@ def alone(function: Callable[[Task], Answer], task: Task) -> Answer | LostError:
         pool.stop()
 
 
-def done_well(future: Future | None) -> bool:
+def done_well(future: Future[Any] | None) -> bool:
     return future is not None and future.done() and not isinstance(future.exception(), BrokenProcessPool)
 
 
@@ -123,7 +123,7 @@ class Process(SpawnProcess):
     def _Popen(process_obj: Any) -> Any:  # noqa: N802 (multiprocessing's name)
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
-            return SpawnProcess._Popen(process_obj)  # type: ignore[attr-defined]
+            return SpawnProcess._Popen(process_obj)
         finally:
             sys.modules["__main__"] = main
 

@@ -14,11 +14,11 @@ UTM = np.array([691_000.0, 5_335_000.0, 520.0])
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, fmr, samples):
+def run(tmp_path_factory, fmr_process, samples):
     """One run that writes everything there is to write: (folder, process)."""
     folder = tmp_path_factory.mktemp("align")
     outputs = ["-o", "T.txt", "--aligned", "moved.ply", "--merged", "both.pcd", "--metrics", "metrics.json", "--json"]
-    return folder, fmr("align", samples / "scan_a.ply", samples / "scan_b.ply", *outputs, cwd=folder)
+    return folder, fmr_process("align", samples / "scan_a.ply", samples / "scan_b.ply", *outputs, cwd=folder)
 
 
 def test_the_samples_are_aligned(run, truth, pose_error):
@@ -161,7 +161,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("arguments", "named"), BAD.values(), ids=BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(fmr_here, samples, tmp_path, arguments, named):
+def test_bad_input_is_one_line_and_leaves_nothing(fmr, samples, tmp_path, arguments, named):
     (tmp_path / "a.ply").symlink_to(samples / "scan_a.ply")
     (tmp_path / "b.ply").symlink_to(samples / "scan_b.ply")
     (tmp_path / "empty.ply").touch()
@@ -170,7 +170,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(fmr_here, samples, tmp_path, a
     np.savetxt(tmp_path / "place.xyz", np.ones((50, 3)))
     np.savetxt(tmp_path / "shear.txt", np.eye(4) + np.eye(4, k=1))
     before = sorted(tmp_path.iterdir())
-    done = fmr_here("align", *arguments, cwd=tmp_path)
+    done = fmr("align", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1
@@ -180,7 +180,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(fmr_here, samples, tmp_path, a
 
 
 @pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="this machine has a GPU")
-def test_a_gpu_that_is_not_there(fmr_here):
-    done = fmr_here("align", "scan_a.ply", "scan_b.ply", "--device", "cuda")
+def test_a_gpu_that_is_not_there(fmr):
+    done = fmr("align", "scan_a.ply", "scan_b.ply", "--device", "cuda")
     assert done.returncode == 2
     assert "cuda" in done.stderr

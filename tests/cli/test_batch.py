@@ -6,11 +6,11 @@ import csv
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
+from command import process_of
 
 from fmr_cli import read_cloud, read_transform, write_cloud
 
@@ -41,8 +41,8 @@ def without_seconds(table):
     return [{name: value for name, value in row.items() if name != "seconds"} for row in table]
 
 
-def test_a_row_for_each_pair_in_the_manifests_order(fmr, folder, truth, pose_error):
-    done = fmr("batch", "pairs.csv", "--out", "out", "--aligned", "--merged", cwd=folder)
+def test_a_row_for_each_pair_in_the_manifests_order(fmr_process, folder, truth, pose_error):
+    done = fmr_process("batch", "pairs.csv", "--out", "out", "--aligned", "--merged", cwd=folder)
     assert done.returncode == 3, done.stderr
     assert "3 aligned, 0 uncertain, 1 failed" in done.stderr
     table = rows(folder)
@@ -63,19 +63,21 @@ def test_a_row_for_each_pair_in_the_manifests_order(fmr, folder, truth, pose_err
 
 
 def test_the_same_results_with_any_number_of_workers_and_as_one_pair(fmr, folder):
-    (folder / "pairs.csv").write_text("source,target\n" + 3 * "a.ply,b.ply\n")
-    for workers in (1, 3):
+    (folder / "pairs.csv").write_text("source,target\n" + 2 * "a.ply,b.ply\n")
+    for workers in (1, 2):
         assert fmr("batch", "pairs.csv", "--out", f"w{workers}", "--workers", workers, cwd=folder).returncode == 0
-    assert without_seconds(rows(folder, "w1")) == without_seconds(rows(folder, "w3"))
+    assert without_seconds(rows(folder, "w1")) == without_seconds(rows(folder, "w2"))
     single = fmr("align", "a.ply", "b.ply", "-q", cwd=folder).stdout
-    for path in (*(folder / "w1/transforms").iterdir(), *(folder / "w3/transforms").iterdir()):
+    for path in (*(folder / "w1/transforms").iterdir(), *(folder / "w2/transforms").iterdir()):
         assert path.read_text() == single
 
 
+@pytest.mark.slow
 def test_a_kill_loses_no_row_and_resume_repeats_none(fmr, folder):
     (folder / "pairs.csv").write_text("source,target\n" + 4 * "a.ply,b.ply\n")
-    command = [sys.executable, "-m", "fmr_cli.cli", "batch", "pairs.csv", "--out", "out", "--workers", "1"]
-    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        process_of("batch", "pairs.csv", "--out", "out", "--workers", "1"), cwd=folder, stderr=subprocess.DEVNULL
+    )
     results = folder / "out" / "results.csv"
     while process.poll() is None and not (results.exists() and results.read_text().count("\n") >= 2):
         time.sleep(0.02)
@@ -97,13 +99,13 @@ def test_a_kill_loses_no_row_and_resume_repeats_none(fmr, folder):
     assert results.read_bytes() == again
 
 
-def test_resume_refuses_another_manifest_and_other_settings(fmr_here, folder):
+def test_resume_refuses_another_manifest_and_other_settings(fmr, folder):
     (folder / "pairs.csv").write_text("source,target\na.ply,missing.ply\n")
     (folder / "other.csv").write_text("source,target\nb.ply,missing.ply\n")
-    assert fmr_here("batch", "pairs.csv", "--out", "out", cwd=folder).returncode == 3
+    assert fmr("batch", "pairs.csv", "--out", "out", cwd=folder).returncode == 3
     before = (folder / "out" / "results.csv").read_bytes()
     for arguments, said in ((["other.csv"], "manifest"), (["pairs.csv", "--seed", 1], "settings")):
-        done = fmr_here("batch", *arguments, "--out", "out", "--resume", cwd=folder)
+        done = fmr("batch", *arguments, "--out", "out", "--resume", cwd=folder)
         assert done.returncode == 2
         assert said in done.stderr
     assert (folder / "out" / "results.csv").read_bytes() == before
@@ -132,17 +134,17 @@ BAD = {
 
 
 @pytest.mark.parametrize("text", BAD.values(), ids=BAD)
-def test_a_bad_manifest_is_one_line_and_leaves_nothing(fmr_here, tmp_path, text):
+def test_a_bad_manifest_is_one_line_and_leaves_nothing(fmr, tmp_path, text):
     if text is not None:
         (tmp_path / "pairs.csv").write_text(text)
-    done = fmr_here("batch", "pairs.csv", "--out", "out", cwd=tmp_path)
+    done = fmr("batch", "pairs.csv", "--out", "out", cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "pairs.csv" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
-def test_an_output_folder_without_a_parent(fmr_here, folder):
-    done = fmr_here("batch", "pairs.csv", "--out", "no/such", cwd=folder)
+def test_an_output_folder_without_a_parent(fmr, folder):
+    done = fmr("batch", "pairs.csv", "--out", "no/such", cwd=folder)
     assert done.returncode == 2
     assert "does not exist" in done.stderr

@@ -10,7 +10,7 @@ from fmr_cli.cli.console import show_log
 
 
 @pytest.fixture
-def logged(monkeypatch, fmr_here):
+def logged(monkeypatch, fmr):
     """Runs `fmr align` where the library logs two lines, with further arguments; gives stderr's lines."""
     from fmr_cli.registration import pipeline
 
@@ -22,7 +22,7 @@ def logged(monkeypatch, fmr_here):
         return align(*given, **more)
 
     monkeypatch.setattr(pipeline, "align", logging_align)
-    yield lambda *more: fmr_here("align", "scan_a.ply", "scan_b.ply", *more).stderr.splitlines()
+    yield lambda *more: fmr("align", "scan_a.ply", "scan_b.ply", *more).stderr.splitlines()
     show_log(0)
 
 
@@ -38,8 +38,8 @@ def test_the_log_is_shown_as_far_as_it_is_asked_for(logged):
 @pytest.mark.parametrize(
     "arguments", [("--debug", "align", "no.ply", "x.ply"), ("align", "no.ply", "x.ply", "--debug")]
 )
-def test_debug_shows_where_an_error_comes_from(fmr_here, arguments):
-    done = fmr_here(*arguments)
+def test_debug_shows_where_an_error_comes_from(fmr, arguments):
+    done = fmr(*arguments)
     assert done.returncode == 2
     assert done.stderr.startswith("Traceback")
     assert done.stderr.splitlines()[-1].endswith("no.ply: no such file, check the name")

@@ -8,16 +8,16 @@ import pytest
 import fmr_cli
 
 
-def test_help_names_the_commands(fmr):
-    done = fmr("--help")
+def test_help_names_the_commands(fmr_process):
+    done = fmr_process("--help")
     assert done.returncode == 0
     assert {"align", "batch", "multiway", "sequence", "info", "transform", "train", "evaluate"} <= set(
         done.stdout.split()
     )
 
 
-def test_version(fmr):
-    assert fmr("--version").stdout.strip() == fmr_cli.__version__
+def test_version(fmr_process):
+    assert fmr_process("--version").stdout.strip() == fmr_cli.__version__
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("align", "--help"), ("align", "--sideways")])
@@ -32,8 +32,8 @@ def test_what_only_looks_at_the_arguments_imports_nothing_heavy(arguments):
     assert done.stdout.splitlines()[-1] == "[]", "the start of every command waits for these"
 
 
-def test_completion_of_the_shell_can_be_installed(fmr_here):
-    assert "--install-completion" in fmr_here("--help").stdout
+def test_completion_of_the_shell_can_be_installed(fmr):
+    assert "--install-completion" in fmr("--help").stdout
 
 
 def test_an_unknown_option_is_bad_input(fmr):

@@ -28,11 +28,11 @@ COUNTS = {
 
 
 @pytest.fixture(scope="module")
-def said(shared_data: Path, fmr: Fmr) -> dict[str, dict]:
+def said(shared_data: Path, fmr_process: Fmr) -> dict[str, dict]:
     """What one run of the command says about every real scan, by the file's name."""
     scans = sorted([*shared_data.glob("hdl64/*.pcd"), *shared_data.glob("kitti_raw/*.bin")])
     files = [*COUNTS, *(str(path.relative_to(shared_data)) for path in scans)]
-    done = fmr("info", *files, "--json", cwd=shared_data)
+    done = fmr_process("info", *files, "--json", cwd=shared_data)
     assert (done.returncode, done.stderr) == (0, "")
     return {entry["file"]: entry for entry in json.loads(done.stdout)}
 

@@ -23,8 +23,8 @@ def schema(value: Any) -> Any:
     return "null"
 
 
-def test_the_metrics_have_the_keys_and_types_of_the_golden_file(fmr_here, samples, tmp_path):
-    done = fmr_here("align", samples / "scan_a.ply", samples / "scan_b.ply", "--metrics", tmp_path / "m.json")
+def test_the_metrics_have_the_keys_and_types_of_the_golden_file(fmr, samples, tmp_path):
+    done = fmr("align", samples / "scan_a.ply", samples / "scan_b.ply", "--metrics", tmp_path / "m.json")
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "m.json").read_text())
     assert "total" in metrics["seconds"]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
+from command import process_of
 from rooms import room_views
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
@@ -22,13 +23,33 @@ def clouds():
     return room_views(3, 4)
 
 
-@pytest.fixture
-def folder(tmp_path, clouds):
-    (tmp_path / "scans").mkdir()
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory, clouds):
+    """A folder with the folder of scans."""
+    folder = tmp_path_factory.mktemp("network")
+    (folder / "scans").mkdir()
     for n, points in enumerate(clouds[0]):
         grey = np.full(len(points), n, np.uint8)
-        write_cloud(tmp_path / "scans" / f"s{n}.ply", PointCloud(points, {"intensity": grey}))
+        write_cloud(folder / "scans" / f"s{n}.ply", PointCloud(points, {"intensity": grey}))
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path, scans):
+    """A copy of it."""
+    shutil.copytree(scans / "scans", tmp_path / "scans")
     return tmp_path
+
+
+RUN = ("multiway", "scans", "--aligned", "--anchor", "s2", "--merged", "all.ply", "--out", "out")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, fmr_process, scans):
+    """One run that several tests look at: (its folder, the process)."""
+    folder = tmp_path_factory.mktemp("run")
+    shutil.copytree(scans / "scans", folder / "scans")
+    return folder, fmr_process(*RUN, cwd=folder)
 
 
 def table(path):
@@ -42,8 +63,8 @@ def result(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in files}
 
 
-def test_what_is_written(fmr, folder, clouds, worst_pose):
-    done = fmr("multiway", "scans", "--out", "out", "--merged", "all.ply", "--aligned", "--anchor", "s2", cwd=folder)
+def test_what_is_written(run, clouds, worst_pose):
+    folder, done = run
     assert done.returncode == 0, done.stderr
     assert "4 of 4 scans placed" in done.stderr
     scans = table(folder / "out" / "scans.csv")
@@ -86,11 +107,10 @@ def worst_pose():
     return worst
 
 
-def test_gtsam_reads_the_graph(fmr, folder):
+def test_gtsam_reads_the_graph(run):
     import gtsam
 
-    assert fmr("multiway", "scans", "--out", "out", "-q", cwd=folder).returncode == 0
-    graph, values = gtsam.readG2o(str(folder / "out" / "network.g2o"), True)
+    graph, values = gtsam.readG2o(str(run[0] / "out" / "network.g2o"), True)
     assert values.size() == 4
     found = gtsam.LevenbergMarquardtOptimizer(
         anchored(graph, values, gtsam), values
@@ -107,7 +127,7 @@ def anchored(graph, values, gtsam):
 
 def started(folder, *extra, **given):
     """A run as a process of its own, with one worker, that hears Ctrl-C."""
-    command = [sys.executable, "-m", "fmr_cli.cli", "multiway", "scans", "--out", "out", "--workers", "1", *extra]
+    command = process_of(*RUN, "--workers", "1", *extra)
     unmasked = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **given}
     return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True, **unmasked)
 
@@ -117,8 +137,8 @@ def wait_for_lines(process, journal, count):
         time.sleep(0.01)
 
 
-def test_ctrl_c_and_a_kill_lose_no_link_and_resume_gives_the_same(fmr, folder):
-    assert fmr("multiway", "scans", "--out", "whole", "-q", cwd=folder).returncode == 0
+@pytest.mark.slow
+def test_ctrl_c_and_a_kill_lose_no_link_and_resume_gives_the_same(fmr, folder, run):
     journal = folder / "out" / "journal.jsonl"
     process = started(folder)
     wait_for_lines(process, journal, 2)
@@ -136,15 +156,16 @@ def test_ctrl_c_and_a_kill_lose_no_link_and_resume_gives_the_same(fmr, folder):
     assert len(kept) > len(stopped)
     assert kept[: len(stopped)] == stopped
     assert not (folder / "out" / "scans.csv").exists()
-    refused = fmr("multiway", "scans", "--out", "out", cwd=folder)
+    refused = fmr(*RUN, cwd=folder)
     assert refused.returncode == 2
     assert "--resume" in refused.stderr
-    assert fmr("multiway", "scans", "--out", "out", "--resume", "-q", cwd=folder).returncode == 0
+    assert fmr(*RUN, "--resume", "-q", cwd=folder).returncode == 0
     assert journal.read_text().splitlines()[: len(kept)] == kept, "what was done is not done again"
-    assert result(folder / "out") == result(folder / "whole")
+    assert result(folder / "out") == result(run[0] / "out")
     assert not (folder / "out" / "work").exists()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_loses_nothing(fmr, folder):
     import resource
 
@@ -153,7 +174,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(fmr, folder):
         return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
     journal = folder / "out" / "journal.jsonl"
-    for size, file, extra in ((6_000, "journal.jsonl", ()), (100_000, "all.ply", ("--merged", "all.ply", "--resume"))):
+    for size, file, extra in ((6_000, "journal.jsonl", ()), (100_000, "out/aligned/s0.ply", ("--resume",))):
         process = started(folder, *extra, preexec_fn=limited(size))
         said = process.communicate()[1]
         assert process.returncode == 2, said
@@ -163,20 +184,21 @@ def test_a_full_disk_is_one_line_and_loses_nothing(fmr, folder):
         kept = journal.read_bytes()
         kept = kept[: kept.rfind(b"\n") + 1]
         assert kept.count(b"\n") >= 2
-    assert fmr("multiway", "scans", "--out", "out", "--resume", "-q", cwd=folder).returncode == 0
+    assert fmr(*RUN, "--resume", "-q", cwd=folder).returncode == 0
     assert journal.read_bytes().startswith(kept)
 
 
-def test_resume_refuses_other_settings(fmr, folder):
-    assert fmr("multiway", "scans", "--out", "out", "-q", cwd=folder).returncode == 0
+def test_resume_refuses_other_settings(fmr, folder, run):
+    shutil.copytree(run[0] / "out", folder / "out")
     before = result(folder / "out")
-    done = fmr("multiway", "scans", "--out", "out", "--resume", "--seed", "1", cwd=folder)
+    done = fmr(*RUN, "--resume", "--seed", "1", cwd=folder)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "other scans or settings" in done.stderr
     assert result(folder / "out") == before
 
 
+@pytest.mark.slow
 def test_what_cannot_be_joined_is_exit_code_3_and_said(fmr, folder):
     points = np.random.default_rng(0).normal(size=(2000, 3))
     write_cloud(folder / "scans" / "noise.ply", PointCloud(points))
@@ -204,17 +226,18 @@ BAD = {
 
 
 @pytest.mark.parametrize(("arguments", "said"), BAD.values(), ids=BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(fmr_here, folder, arguments, said):
+def test_bad_input_is_one_line_and_leaves_nothing(fmr, folder, arguments, said):
     (folder / "empty.csv").write_text("source,target\n")
     before = sorted(folder.rglob("*"))
     out = [] if "--out" in arguments else ["--out", "out"]
-    done = fmr_here("multiway", *arguments, *out, cwd=folder)
+    done = fmr("multiway", *arguments, *out, cwd=folder)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
     assert sorted(folder.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_contradictory_fixed_poses_are_said(fmr, folder, clouds):
     """Two scans whose files lie anywhere are told to stay there: their link contradicts that, and is named."""
     done = fmr("multiway", "scans", "--out", "out", "--fixed", "s0", "--fixed", "s1", cwd=folder)

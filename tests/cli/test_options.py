@@ -23,7 +23,7 @@ def test_the_defaults_are_the_librarys():
     assert given == [Options()]
 
 
-def test_every_option_arrives(fmr_here, monkeypatch):
+def test_every_option_arrives(fmr, monkeypatch):
     from fmr_cli.registration import pipeline
 
     class SeenError(Exception):
@@ -34,7 +34,7 @@ def test_every_option_arrives(fmr_here, monkeypatch):
 
     monkeypatch.setattr(pipeline, "align", align)
     with pytest.raises(SeenError) as seen:
-        fmr_here(
+        fmr(
             "align", "scan_a.ply", "scan_b.ply", "--init", "search", "--voxel-size", 0.5, "--no-normalize",
             "--points", 99, "--dof", "yaw", "--up", 0, 1, 0, "--scale", "--max-angle", 5, "--max-shift", 6,
             "--iterations", 7, "--no-robust", "--no-refine", "--allow-mirror",
@@ -47,7 +47,7 @@ def test_every_option_arrives(fmr_here, monkeypatch):
     )  # fmt: skip
     changed = [f.name for f in fields(Options) if getattr(seen.value.args[0], f.name) != f.default]
     with pytest.raises(SeenError) as seen:
-        fmr_here("align", "scan_a.ply", "scan_b.ply", "--unit", "mm:m")  # which does without --scale and a given --init
+        fmr("align", "scan_a.ply", "scan_b.ply", "--unit", "mm:m")  # which does without --scale and a given --init
     assert seen.value.args[0] == Options(unit="mm:m")
     assert {*changed, "unit"} == {f.name for f in fields(Options)}, "an option is missing above"
 
@@ -65,16 +65,16 @@ def test_every_option_arrives(fmr_here, monkeypatch):
         (("--init", "twice.txt"), "fmr: --init: its transform scales by 2; add --scale, or give a rigid motion"),
     ],
 )
-def test_a_wrong_value_is_one_line(fmr_here, tmp_path, arguments, said):
+def test_a_wrong_value_is_one_line(fmr, tmp_path, arguments, said):
     np.savetxt(tmp_path / "twice.txt", np.diag([2.0, 2.0, 2.0, 1.0]))
-    done = fmr_here("align", "a.ply", "b.ply", *arguments, cwd=tmp_path)
+    done = fmr("align", "a.ply", "b.ply", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith(said)
     assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(("name", "known"), [("dof", "planar"), ("device", "cuda")])
-def test_an_unknown_word_names_the_choices(fmr_here, name, known):
-    done = fmr_here("align", "a.ply", "b.ply", f"--{name}", "other")
+def test_an_unknown_word_names_the_choices(fmr, name, known):
+    done = fmr("align", "a.ply", "b.ply", f"--{name}", "other")
     assert done.returncode == 2
     assert known in done.stderr

@@ -9,11 +9,11 @@ import sys
 import pytest
 
 
-def test_a_report_and_a_picture_of_the_samples(tmp_path, fmr_here):
+def test_a_report_and_a_picture_of_the_samples(tmp_path, fmr):
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
     outputs = ["-o", tmp_path / "T.txt", "--report", tmp_path / "r.html", "--picture", tmp_path / "p.png"]
-    done = fmr_here("align", "scan_a.ply", "scan_b.ply", *outputs)
+    done = fmr("align", "scan_a.ply", "scan_b.ply", *outputs)
     assert done.returncode == 0
     text = (tmp_path / "r.html").read_text("utf-8")
     assert text.startswith("<!doctype html>")
@@ -37,19 +37,19 @@ def test_a_report_and_a_picture_of_the_samples(tmp_path, fmr_here):
         (("view", "--result", "."), "holds neither network.json"),
     ],
 )
-def test_what_cannot_be_is_said_on_one_line(fmr_here, arguments, said):
-    done = fmr_here(*arguments)
+def test_what_cannot_be_is_said_on_one_line(fmr, arguments, said):
+    done = fmr(*arguments)
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(("option", "lacking"), [("--report", "jinja2"), ("--picture", "matplotlib")])
-def test_without_the_extra_the_remedy_is_said_before_anything_is_read(fmr_here, tmp_path, monkeypatch, option, lacking):
+def test_without_the_extra_the_remedy_is_said_before_anything_is_read(fmr, tmp_path, monkeypatch, option, lacking):
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == lacking else there(name, *a))
     path = tmp_path / ("r.html" if option == "--report" else "p.png")
-    done = fmr_here("align", "no_such.ply", "scan_b.ply", option, path)
+    done = fmr("align", "no_such.ply", "scan_b.ply", option, path)
     assert done.returncode == 2
     assert "pip install 'fmr-cli[report]'" in done.stderr
 

@@ -33,9 +33,9 @@ def table(path):
         return list(csv.DictReader(file))
 
 
-def test_poses_residuals_and_map_of_a_moving_start(fmr_here, street, tmp_path):
+def test_poses_residuals_and_map_of_a_moving_start(fmr, street, tmp_path):
     folder, truth = street
-    done = fmr_here(
+    done = fmr(
         "sequence", folder, "--out", tmp_path / "poses.txt", "--residuals", tmp_path / "r.csv",
         "--merged", tmp_path / "map.ply",
     )  # fmt: skip
@@ -52,10 +52,10 @@ def test_poses_residuals_and_map_of_a_moving_start(fmr_here, street, tmp_path):
     assert not (tmp_path / "poses.txt.journal").exists()
 
 
-def test_natural_order_and_a_choice_of_scans(fmr_here, street, tmp_path):
+def test_natural_order_and_a_choice_of_scans(fmr, street, tmp_path):
     folder = copy(street, tmp_path)
     (folder / "7.bin").rename(folder / "10.bin")
-    done = fmr_here(
+    done = fmr(
         "sequence", folder, "--out", tmp_path / "p.json", "--format", "json", "--start", 2, "--step", 2,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -64,15 +64,15 @@ def test_natural_order_and_a_choice_of_scans(fmr_here, street, tmp_path):
     ]  # fmt: skip
 
 
-def test_kitti_folder_with_times_and_calibration(fmr_here, street, tmp_path):
+def test_kitti_folder_with_times_and_calibration(fmr, street, tmp_path):
     root = tmp_path / "00"
     shutil.copytree(street[0], root / "velodyne")
     Tr = np.array([[0.0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]])
     (root / "calib.txt").write_text("P0: 1 2 3\nTr: " + " ".join(map(str, Tr.ravel())) + "\n")
     (root / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(FRAMES)))
-    assert fmr_here("sequence", root, "--out", tmp_path / "s.txt", "--stop", 3).returncode == 0
-    assert fmr_here("sequence", root, "--out", tmp_path / "c.txt", "--stop", 3, "--camera-frame").returncode == 0
-    assert fmr_here("sequence", root, "--out", tmp_path / "t.txt", "--stop", 3, "--format", "tum").returncode == 0
+    assert fmr("sequence", root, "--out", tmp_path / "s.txt", "--stop", 3).returncode == 0
+    assert fmr("sequence", root, "--out", tmp_path / "c.txt", "--stop", 3, "--camera-frame").returncode == 0
+    assert fmr("sequence", root, "--out", tmp_path / "t.txt", "--stop", 3, "--format", "tum").returncode == 0
     T = np.vstack([Tr, [0, 0, 0, 1]])
     expected = T @ read_poses(tmp_path / "s.txt") @ np.linalg.inv(T)
     assert np.allclose(read_poses(tmp_path / "c.txt"), expected, atol=1e-12)
@@ -81,14 +81,14 @@ def test_kitti_folder_with_times_and_calibration(fmr_here, street, tmp_path):
     assert np.allclose(tum[:, 1:4], read_poses(tmp_path / "s.txt")[:, :3, 3])
 
 
-def test_a_list_of_scans(fmr_here, street, tmp_path):
+def test_a_list_of_scans(fmr, street, tmp_path):
     (tmp_path / "scans.txt").write_text("".join(f"{street[0] / f'{i}.bin'}\n" for i in (0, 1, 2)))
-    assert fmr_here("sequence", tmp_path / "scans.txt", "--out", tmp_path / "p.txt").returncode == 0
+    assert fmr("sequence", tmp_path / "scans.txt", "--out", tmp_path / "p.txt").returncode == 0
     assert len(read_poses(tmp_path / "p.txt")) == 3
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "other unit"])
-def test_a_bad_scan_is_bridged_and_named(fmr_here, street, tmp_path, damage):
+def test_a_bad_scan_is_bridged_and_named(fmr, street, tmp_path, damage):
     folder, truth = copy(street, tmp_path), street[1]
     bad = folder / "4.bin"
     if damage == "truncated":
@@ -97,7 +97,7 @@ def test_a_bad_scan_is_bridged_and_named(fmr_here, street, tmp_path, damage):
         bad.write_bytes(b"")
     else:
         write_cloud(bad, PointCloud(read_cloud(bad).points * 1000))
-    done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", "--residuals", tmp_path / "r.csv")
+    done = fmr("sequence", folder, "--out", tmp_path / "p.txt", "--residuals", tmp_path / "r.csv")
     assert done.returncode == 3
     assert "1 uncertain, look at: 4 (4.bin)" in done.stderr
     assert "frame 4 is bridged" in done.stderr
@@ -106,19 +106,19 @@ def test_a_bad_scan_is_bridged_and_named(fmr_here, street, tmp_path, damage):
     assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.05
 
 
-def test_not_finite_points_are_left_out(fmr_here, street, tmp_path):
+def test_not_finite_points_are_left_out(fmr, street, tmp_path):
     folder = copy(street, tmp_path)
     rows = np.fromfile(folder / "2.bin", np.float32).reshape(-1, 4)
     rows[::50, 1] = np.nan
     rows.tofile(folder / "2.bin")
-    assert fmr_here("sequence", folder, "--out", tmp_path / "p.txt").returncode == 0
+    assert fmr("sequence", folder, "--out", tmp_path / "p.txt").returncode == 0
 
 
-def test_of_two_formats_one_is_taken_and_named(fmr_here, street, tmp_path):
+def test_of_two_formats_one_is_taken_and_named(fmr, street, tmp_path):
     folder = copy(street, tmp_path)
     write_cloud(folder / "extra.ply", read_cloud(folder / "0.bin"))
     (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
-    done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", "--stop", 2)
+    done = fmr("sequence", folder, "--out", tmp_path / "p.txt", "--stop", 2)
     assert done.returncode == 0
     assert f"the {FRAMES} .bin files are taken, 1 .ply left out" in done.stderr
 
@@ -130,25 +130,25 @@ def test_of_two_formats_one_is_taken_and_named(fmr_here, street, tmp_path):
         (lambda folder: (folder / "a.bin").write_bytes(b"0" * 1600), "one scan only"),
     ],
 )
-def test_too_few_scans_are_one_line(fmr_here, tmp_path, make, says):
+def test_too_few_scans_are_one_line(fmr, tmp_path, make, says):
     (tmp_path / "scans").mkdir()
     make(tmp_path / "scans")
-    done = fmr_here("sequence", tmp_path / "scans", "--out", tmp_path / "p.txt")
+    done = fmr("sequence", tmp_path / "scans", "--out", tmp_path / "p.txt")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert says in done.stderr
     assert not (tmp_path / "p.txt").exists()
 
 
-def test_camera_frame_without_calibration_is_one_line(fmr_here, street, tmp_path):
-    done = fmr_here("sequence", street[0], "--out", tmp_path / "p.txt", "--camera-frame")
+def test_camera_frame_without_calibration_is_one_line(fmr, street, tmp_path):
+    done = fmr("sequence", street[0], "--out", tmp_path / "p.txt", "--camera-frame")
     assert done.returncode == 2
     assert "no calib.txt" in done.stderr
 
 
-def test_killed_and_resumed_it_comes_to_the_same_poses(fmr_here, street, tmp_path):
+def test_killed_and_resumed_it_comes_to_the_same_poses(fmr, street, tmp_path):
     folder = street[0]
-    assert fmr_here("sequence", folder, "--out", tmp_path / "whole.txt").returncode == 0
+    assert fmr("sequence", folder, "--out", tmp_path / "whole.txt").returncode == 0
     out, residuals = tmp_path / "p.txt", tmp_path / "r.csv"
     command = [sys.executable, "-m", "fmr_cli.cli", "sequence", folder, "--out", out, "--residuals", residuals]
     process = subprocess.Popen([str(part) for part in command], stderr=subprocess.DEVNULL)
@@ -157,19 +157,19 @@ def test_killed_and_resumed_it_comes_to_the_same_poses(fmr_here, street, tmp_pat
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert 3 <= out.read_text().count("\n") < FRAMES
-    other = fmr_here("sequence", folder, "--out", out, "--residuals", residuals, "--resume", "--voxel-size", 1)
+    other = fmr("sequence", folder, "--out", out, "--residuals", residuals, "--resume", "--voxel-size", 1)
     assert other.returncode == 2
     assert "voxel_size" in other.stderr
-    assert fmr_here("sequence", folder, "--out", out, "--residuals", residuals, "--resume").returncode == 0
+    assert fmr("sequence", folder, "--out", out, "--residuals", residuals, "--resume").returncode == 0
     assert np.abs(read_poses(out) - read_poses(tmp_path / "whole.txt")).max() < 1e-9
     assert [row["frame"] for row in table(residuals)] == [str(i) for i in range(FRAMES)]
 
 
-def test_errors_against_the_truth_and_a_plot(fmr_here, street, tmp_path):
+def test_errors_against_the_truth_and_a_plot(fmr, street, tmp_path):
     pytest.importorskip("evo")
     folder, truth = street
     write_poses(tmp_path / "truth.txt", truth)
-    done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", "--truth", tmp_path / "truth.txt", "--step", 2)
+    done = fmr("sequence", folder, "--out", tmp_path / "p.txt", "--truth", tmp_path / "truth.txt", "--step", 2)
     assert done.returncode == 0, done.stderr
     errors = json.loads((tmp_path / "p.evaluation.json").read_text())
     assert errors["frames"] == FRAMES // 2
@@ -178,20 +178,20 @@ def test_errors_against_the_truth_and_a_plot(fmr_here, street, tmp_path):
     assert (tmp_path / "p.png").stat().st_size > 1000
 
 
-def test_a_truth_of_another_length_is_one_line(fmr_here, street, tmp_path):
+def test_a_truth_of_another_length_is_one_line(fmr, street, tmp_path):
     pytest.importorskip("evo")
     write_poses(tmp_path / "truth.txt", street[1][:3])
-    done = fmr_here("sequence", street[0], "--out", tmp_path / "p.txt", "--truth", tmp_path / "truth.txt")
+    done = fmr("sequence", street[0], "--out", tmp_path / "p.txt", "--truth", tmp_path / "truth.txt")
     assert done.returncode == 2
     assert f"3 poses for {FRAMES} scans" in done.stderr
     assert not (tmp_path / "p.txt").exists()
 
 
-def test_deskew_undoes_the_motion_within_the_scans(fmr_here, moving, tmp_path):
+def test_deskew_undoes_the_motion_within_the_scans(fmr, moving, tmp_path):
     folder, truth = moving
     end_errors = []
     for options in (["--no-deskew"], []):
-        done = fmr_here("sequence", folder, "--out", tmp_path / "p.txt", *options)
+        done = fmr("sequence", folder, "--out", tmp_path / "p.txt", *options)
         assert done.returncode == 0, done.stderr
         error = np.linalg.inv(read_poses(tmp_path / "p.txt")) @ truth
         end_errors.append([np.linalg.norm(error[-1, :3, 3]), angle_degrees(error[-1])])
@@ -200,15 +200,15 @@ def test_deskew_undoes_the_motion_within_the_scans(fmr_here, moving, tmp_path):
     assert angle_deskewed < min(0.15, angle / 5)
 
 
-def test_deskew_of_scans_without_times_is_one_line(fmr_here, street, tmp_path):
-    done = fmr_here("sequence", street[0], "--out", tmp_path / "p.txt", "--deskew")
+def test_deskew_of_scans_without_times_is_one_line(fmr, street, tmp_path):
+    done = fmr("sequence", street[0], "--out", tmp_path / "p.txt", "--deskew")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "0.bin: has no time per point (fields gps_time, time, timestamp, t, " in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_priors_and_a_known_map(fmr_here, street, tmp_path):
+def test_priors_and_a_known_map(fmr, street, tmp_path):
     """The drive's second half, named by its times, in the map of its first; one first pose is told, roughly."""
     scans, truth = [read_cloud(street[0] / f"{i}.bin") for i in range(FRAMES)], street[1]
     first = [scan.transformed(T).points for scan, T in zip(scans[:5], truth, strict=False)]
@@ -219,7 +219,7 @@ def test_priors_and_a_known_map(fmr_here, street, tmp_path):
         write_cloud(folder / f"{100 + i / 20:.2f}.ply", scans[i])
     rough = " ".join(f"{x:.12g}" for x in (truth[4] @ turn_and_shift(2.0, 0.4))[:3].ravel())
     (tmp_path / "told.csv").write_text(f"scan,pose,sigma_shift\n100.20,{rough},0.5\n")
-    done = fmr_here(
+    done = fmr(
         "sequence", folder, "--out", tmp_path / "p.tum", "--map", tmp_path / "known.las",
         "--init-poses", tmp_path / "told.csv", "--format", "tum",
     )  # fmt: skip
@@ -227,6 +227,6 @@ def test_priors_and_a_known_map(fmr_here, street, tmp_path):
     rows = np.loadtxt(tmp_path / "p.tum")
     assert np.allclose(rows[:, 0], [100.2, 100.25, 100.3])
     assert np.abs(rows[:, 1:4] - truth[4:7, :3, 3]).max() < 0.05
-    done = fmr_here("sequence", folder, "--out", tmp_path / "q.txt", "--map", tmp_path / "known.las", "--loop-closure")
+    done = fmr("sequence", folder, "--out", tmp_path / "q.txt", "--map", tmp_path / "known.las", "--loop-closure")
     assert done.returncode == 2
     assert "poses in a known map don't drift" in done.stderr

@@ -50,14 +50,14 @@ def test_what_is_lost_is_said_on_stderr(folder: Path, fmr: Fmr) -> None:
     assert fmr("transform", "a.ply", "T.txt", "-o", "b.bin", "--quiet", cwd=folder).stderr == ""
 
 
-def test_a_real_las_file_keeps_everything_but_its_place(shared_data: Path, tmp_path: Path, fmr: Fmr) -> None:
+def test_a_real_las_file_keeps_everything_but_its_place(shared_data: Path, tmp_path: Path, fmr_process: Fmr) -> None:
     angle = np.radians(3)
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     turn[:3, 3] = [5, -3, 1]
     write_transform(tmp_path / "T.npy", turn)
     source = shared_data / "las" / "autzen_trim.las"
-    done = fmr("transform", source, "T.npy", "-o", "b.laz", cwd=tmp_path)
+    done = fmr_process("transform", source, "T.npy", "-o", "b.laz", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     a, b = read_cloud(source), read_cloud(tmp_path / "b.laz")
     assert np.abs(b.points - a.transformed(turn).points).max() <= 0.005 + 1e-9

@@ -31,6 +31,7 @@ def module(name: str) -> ModuleType:
 
 examples = module("examples")
 WITH_EXAMPLES = [page for page in SHOWN if examples.examples(page.read_text("utf-8"))]
+FIRST = "README.md"  # its examples run with the quick tests, those of the other pages take minutes
 
 
 def test_it_builds_and_every_link_and_anchor_leads_somewhere(tmp_path: Path) -> None:
@@ -51,7 +52,10 @@ def test_it_builds_and_every_link_and_anchor_leads_somewhere(tmp_path: Path) -> 
     assert "arithmatex" not in method, "an equation is not shown"
 
 
-@pytest.mark.parametrize("page", WITH_EXAMPLES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", [
+    pytest.param(page, id=str(page.relative_to(ROOT)), marks=() if page.name == FIRST else pytest.mark.slow)
+    for page in WITH_EXAMPLES
+])  # fmt: skip
 def test_the_examples_run(page: Path) -> None:
     examples.run_page(page)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from benchmarks import verdict as command
 from fmr_cli.cloud import PointCloud
 from fmr_cli.evaluation import verdict
 from fmr_cli.evaluation.verdict import Judged, aliases_named, judge, nees, reliability, report, summary
@@ -20,7 +20,6 @@ from fmr_cli.geometry.motion import exp
 from fmr_cli.registration.pipeline import align
 from fmr_cli.synthetic.verdict_pairs import fresh_pair
 
-ROOT = Path(__file__).parents[2]
 ROW = Judged("copy", 0, True, False, True, True, "aligned", 0.9, 0.001, 1, 5.0, 6, 0.1)
 
 
@@ -111,16 +110,17 @@ def test_right_is_judged_by_the_source_s_own_points() -> None:
     assert pair.is_right(found.T_target_source)
 
 
-def test_the_command(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "benchmarks.verdict", "--pairs", "3", "--kinds", "copy", "plane"]
-    done = subprocess.run(
-        [*command, "--workers", "1", "--out", str(tmp_path / "v.json")], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "expected calibration error" in done.stdout
+def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
+    def run(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["benchmarks.verdict", *arguments])
+        command.main()
+
+    run("--pairs", "3", "--kinds", "copy", "plane", "--workers", "1", "--out", str(tmp_path / "v.json"))
+    assert "expected calibration error" in capsys.readouterr().out
     said = json.loads((tmp_path / "v.json").read_text())
     assert [row["kind"] for row in said["rows"]] == ["copy", "plane", "copy"]
     assert said["pairs"] == 3
-    unknown = subprocess.run([*command[:3], "--kinds", "teapot"], cwd=ROOT, capture_output=True, text=True)
-    assert unknown.returncode != 0
-    assert "no kind of pairs is called teapot" in unknown.stderr
+    with pytest.raises(SystemExit) as end:
+        run("--kinds", "teapot")
+    assert end.value.code
+    assert "no kind of pairs is called teapot" in f"{end.value.code}{capsys.readouterr().err}"

@@ -57,7 +57,7 @@ def test_the_jacobian_is_the_exact_one(fast: NumpySolver, encoder: Encoder, room
 
 @pytest.mark.parametrize("robust", [True, False])
 @pytest.mark.parametrize("kind", ["copy", "resample", "noise"])
-@pytest.mark.parametrize("degrees", [5, 50])
+@pytest.mark.parametrize("degrees", [pytest.param(5, marks=pytest.mark.slow), 50])
 def test_the_pose_of_the_plain_solver(
     fast: NumpySolver, encoder: Encoder, room: np.ndarray, kind: str, degrees: float, robust: bool
 ) -> None:
@@ -70,8 +70,11 @@ def test_the_pose_of_the_plain_solver(
     np.testing.assert_allclose(found.errors[:both], expected.errors[:both], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("robust", [True, False])
-@pytest.mark.parametrize("kind", ["copy", "resample", "noise"])
+@pytest.mark.parametrize(("kind", "robust"), [
+    ("copy", False), ("resample", True), ("noise", True),
+    pytest.param("copy", True, marks=pytest.mark.slow), pytest.param("resample", False, marks=pytest.mark.slow),
+    pytest.param("noise", False, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_few_of_many_points_lead_to_the_pose_of_all(
     fast: NumpySolver, encoder: Encoder, room: np.ndarray, kind: str, robust: bool
 ) -> None:

@@ -111,3 +111,19 @@ def test_a_constraint_holds_exactly(layers: Layers, body: np.ndarray, centres: n
     assert planar[2].tolist() == [0, 0, 1, 0]
     moved = refine(layers, template, balls(source), np.eye(4), 5, Motion("translation").basis()).g
     assert (moved[:3, :3] == np.eye(3)).all()
+
+
+def test_both_jacobians_undo_a_motion_too_and_come_nearer_by_one_step(
+    layers: Layers, body: np.ndarray, centres: np.ndarray
+) -> None:
+    template = patch_template(layers, centres, balls(body), RADIUS)
+    off = {False: [], True: []}
+    for degrees in (2, 4, 8):
+        T = motion(degrees, 0.01)
+        look = balls(moved_away(T, body))
+        for both, found in off.items():
+            fit = refine(layers, template, look, np.eye(4), 1, both=both)
+            found.append(math.degrees(angle_between(fit.g[:3, :3], T[:3, :3])))
+        fit = refine(layers, template, look, np.eye(4), 15, both=True)
+        assert math.degrees(angle_between(fit.g[:3, :3], T[:3, :3])) < 0.05
+    assert sum(off[True]) < sum(off[False])  # to second order

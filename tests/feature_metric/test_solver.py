@@ -83,7 +83,7 @@ def test_the_mean_of_both_jacobians_errs_by_half(encoder: Encoder, bodies: Tenso
     assert both.abs().mean() < 0.6 * once.abs().mean()
 
 
-@pytest.mark.parametrize(("overlap", "share"), [(0.9, 0.8), (0.8, 0.6)])
+@pytest.mark.parametrize(("overlap", "share"), [pytest.param(0.9, 0.8, marks=pytest.mark.slow), (0.8, 0.6)])
 def test_cut_and_resampled_shapes_are_registered_from_40_degrees(
     encoder: Encoder, overlap: float, share: float
 ) -> None:

@@ -95,4 +95,13 @@ def test_the_covariance_is_that_of_the_error() -> None:
         twist = log(T)
         covariance = observability.certainty(source, target, T, np.zeros(3)).covariance
         squared.append(twist @ np.linalg.solve(covariance, twist))
-    assert 1.5 < np.median(squared) < 25  # within twice the true deviations
+    assert 2 < np.median(squared) < 12  # within 1.6 times the true deviations
+
+
+def test_a_turn_is_seen_about_the_scan_however_far_the_map_s_centre_is(room_scans: Scans) -> None:
+    source, target = (Surface(s, EDGE) for s in room_scans)
+    near = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
+    away = np.array([80.0, 30.0, 0.0])
+    far = observability.certainty(source, target, np.eye(4), away).information
+    assert observability.undetermined(far, 2.0)
+    np.testing.assert_allclose(observability.about(far, -away), near, rtol=1e-6, atol=1e-6 * np.abs(near).max())

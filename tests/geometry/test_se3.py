@@ -97,3 +97,9 @@ def test_numpy_gives_what_torch_gives(angle: float) -> None:
 def test_geometry_does_not_import_torch() -> None:
     code = "import sys; from fmr_cli.geometry import observability, pose_error; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_adjoint_carries_a_twist_through_a_pose() -> None:
+    rng = np.random.default_rng(8)
+    T, xi = se3.exp(rng.normal(size=6)), rng.normal(size=6)
+    np.testing.assert_allclose(T @ se3.exp(xi), se3.exp(se3.adjoint(T) @ xi) @ T, atol=1e-12)

@@ -27,6 +27,8 @@ PLY_TEXT = PLY.replace("binary_little_endian", "ascii")
 FACES = PLY.replace("end_header", "element face 1\nproperty list int int vertex_indices\nend_header")
 PCD = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {}\nHEIGHT 1\nPOINTS {}\nDATA {}\n"
 HUGE = 10**15
+MANY_PROPERTIES = "".join(f"property float p{k}\n" for k in range(10_001)) + "end_header"
+PTX_HEADER = "0\n0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 
 
 def pcd(count: object, kind: str) -> bytes:
@@ -47,6 +49,12 @@ BAD = {
     "list-negative.ply": (FACES.format(1).encode() + bytes(24) + struct.pack("<iii", -7, 0, 0), "'face' lists"),
     "face.ply": (FACES.format(1).encode() + bytes(24) + struct.pack("<iiii", 3, 0, 0, 7), "a vertex it does not have"),
     "words.ply": (PLY_TEXT.format(2).encode() + b"1 2 3\n1 two 3\n", "line 9: expected 3 numbers, found '1 two 3'"),
+    "wide.ply": (
+        PLY.replace("end_header", MANY_PROPERTIES).format(1).encode(),
+        "declares 10004 properties of a vertex",
+    ),
+    "wide.pcd": (pcd(9, "ascii").replace(b"COUNT 1", b"COUNT 20000"), "declares 20002 values of a point"),
+    "empty-scans.ptx": (PTX_HEADER.encode() * 2000, "holds 1000 scans of fewer than 10 points each"),
     "other.ply": (b"\x89PNG\r\n\x1a\n" + bytes(100), "not a PLY file"),
     "promise.pcd": (pcd(HUGE, "binary") + bytes(1200), "promises 1000000000000000"),
     "promise-text.pcd": (pcd(HUGE, "ascii") + b"1 2 3\n" * 9, "promises 1000000000000000"),
@@ -107,6 +115,21 @@ def las_file(path: Path) -> bytearray:
     cloud = PointCloud(np.random.default_rng(0).random((100, 3)), {"label": np.arange(100)})
     write_cloud(path, cloud)
     return bytearray(path.read_bytes())
+
+
+@pytest.mark.parametrize(("place", "kind"), [(12, "<I"), (32, "<H")])  # points of a chunk; items of a point
+def test_a_laz_whose_compression_is_not_said_rightly(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], place: int, kind: str
+) -> None:
+    path = tmp_path / "a.laz"
+    write_cloud(path, PointCloud(np.random.default_rng(0).random((99, 3))))
+    data = bytearray(path.read_bytes())
+    record = data.index(b"laszip encoded") - 2 + 54  # behind the VLR's header
+    struct.pack_into(kind, data, record + place, 0)
+    path.write_bytes(data)
+    with pytest.raises(CloudFileError, match="how its points are compressed, it is damaged: copy it again"):
+        read_cloud(path)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

@@ -9,8 +9,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from bag_files import HESAI, LIVOX, OUSTER, VELODYNE, records, write_bag
-
+from benchmarks.bag_files import HESAI, LIVOX, OUSTER, VELODYNE, records, write_bag
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io import folders, read_cloud, scan_paths, scans_of, write_cloud
 from fmr_cli.io.parts import with_topic

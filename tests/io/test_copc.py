@@ -8,8 +8,8 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from copc_file import write_copc
 
+from benchmarks.copc_file import write_copc
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io import open_cloud, read_cloud, write_cloud
 
@@ -71,7 +71,8 @@ def test_other_formats_have_bounds_and_no_levels(tmp_path: Path, copc: Path, poi
 def test_a_damaged_octree_is_said(tmp_path: Path, copc: Path) -> None:
     data = bytearray(copc.read_bytes())
     evlr = struct.unpack_from("<Q", data, 235)[0] + 60
-    for at, value in ((evlr + 16, 1 << 60), (evlr + 24, -5 & 0xFFFFFFFF), (evlr + 28, 0x7FFFFFFF), (evlr, 99)):
+    for at, value in ((evlr + 16, 1 << 60), (evlr + 16, 8), (evlr + 24, -5 & 0xFFFFFFFF), (evlr + 24, 9),
+                      (evlr + 28, 0x7FFFFFFF), (evlr, 99)):  # fmt: skip
         spoilt = data.copy()
         struct.pack_into("<Q" if value >> 32 else "<I", spoilt, at, value)
         (tmp_path / "a.copc.laz").write_bytes(spoilt)

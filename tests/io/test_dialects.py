@@ -87,6 +87,9 @@ def test_a_bin_whose_values_do_not_tell_is_refused_with_the_choice(tmp_path: Pat
     assert cloud.points[0, 0] == np.fromfile(tmp_path / "a.bin", "<f4")[1]
     with pytest.raises(CloudFileError, match=r"no multiple of the 44 that a point takes \(x y z a b"):
         read_cloud(tmp_path / "a.bin", bin_columns=tuple("xyzabcdefgh"))
+    for columns in (("x", "y", "intensity"), ("x", "y", "z", "t", "t")):
+        with pytest.raises(CloudFileError, match="there must be one x, one y and one z, and each other name once"):
+            read_cloud(tmp_path / "a.bin", bin_columns=columns)
 
 
 def test_ncl_t_and_numbers_that_are_no_float32(tmp_path: Path) -> None:
@@ -112,6 +115,8 @@ def test_ncl_t_and_numbers_that_are_no_float32(tmp_path: Path) -> None:
         (np.ones((480, 640)), "is it a depth image"),
         (np.ones((48, 17)), "is it a depth image"),
         (np.eye(4), "holds a 4x4 transform and no points"),
+        (np.tile(np.eye(4), (30, 1, 1)), "holds poses and no points"),
+        (np.tile(np.eye(4)[:3].ravel(), (30, 1)), "holds poses and no points"),
         (np.ones((7, 2)), "points need (N, 3)"),
         (np.ones((2, 2, 2)), "points need (N, 3)"),
         (np.array(["a", "b"]), "points need numbers"),
@@ -151,6 +156,7 @@ def test_keys_of_an_npz(tmp_path: Path, key: str) -> None:
 COLOURED = {
     "a.obj": "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nvt 0 0\nf 1 2 3\n",
     "b.obj": "v 0 0 0 255 0 9\nv 1 0 0 255 0 9\nv 0 1 0 255 0 9\nf 1 2 3\n",
+    "alpha.obj": "v 0 0 0 255 0 9 0\nv 1 0 0 255 0 9 0\nv 0 1 0 255 0 9 0\nf 1 2 3\n",
     "a.off": "COFF\n3 1 0\n0 0 0 255 0 9 255\n1 0 0 255 0 9 255\n0 1 0 255 0 9 255\n3 0 1 2\n",
     "faces.off": "OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n1 1 0\n3 0 1 2 255 0 9\n3 1 2 3 255 0 9\n",
     "shares.off": "COFF\n3 1 0\n0 0 0 1 0 .5 1\n1 0 0 1 0 .5 1\n0 1 0 1 0 .5 1\n3 0 1 2\n",
@@ -169,6 +175,25 @@ def test_colours_of_meshes_come_along(tmp_path: Path, name: str) -> None:
         "a.obj": ([1], [0]), "shares.off": ([1], [0.5]),
     }.get(name, ([255], [9]))  # fmt: skip
     assert cloud.left_out == (("texture coordinates",) if name == "a.obj" else ())
+    assert ("alpha" in cloud.attributes) == (name in ("alpha.obj", "a.off", "shares.off"))
+
+
+def test_what_is_left_out_of_faces_is_said(tmp_path: Path) -> None:
+    """Texture coordinates and the like; colours where the vertices have their own."""
+    more = "property list uchar float texcoord\nproperty uchar red\n"
+    text = COLOURED["faces.ply"].replace("property uchar red\n", more).replace("3 0 1 2 255", "3 0 1 2 1 0.5 255")
+    (tmp_path / "a.ply").write_text(text)
+    assert read_cloud(tmp_path / "a.ply").left_out == ("property 'texcoord' of the faces",)
+    own = "property float z\nproperty uchar red\n"
+    text = (
+        COLOURED["faces.ply"]
+        .replace("property float z\n", own)
+        .replace("0 0 0\n1 0 0\n0 1 0", "0 0 0 7\n1 0 0 7\n0 1 0 7")
+    )
+    (tmp_path / "b.ply").write_text(text)
+    cloud = read_cloud(tmp_path / "b.ply")
+    assert cloud.left_out == tuple(f"property {name!r} of the faces" for name in ("red", "green", "blue"))
+    assert {*cloud.attributes["red"]} == {7}
 
 
 def turn() -> np.ndarray:

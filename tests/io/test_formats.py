@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.io import WRITABLE, read_cloud, write_cloud
+from fmr_cli.io.mesh import fan
 
 # E57 needs pye57, which is an extra
 HERE = [suffix for suffix in WRITABLE if suffix != ".e57" or find_spec("pye57")]
@@ -302,6 +303,16 @@ def test_the_surface_of_a_mesh_is_sampled_evenly_and_repeatably(tmp_path: Path, 
     if suffix == ".ply":
         assert set(cloud.attributes["red"][cloud.points[:, 0] == 1]) == {255}
         assert set(cloud.attributes["red"][cloud.points[:, 0] == 0]) == {0}
+
+
+def test_polygons_of_any_number_of_corners_become_fans() -> None:
+    """All polygons' first triangles, then their second ones, smaller polygons first; what a face has goes along."""
+    faces = [(0, 1, 2, 3), (4, 5, 6), (7, 8), (9, 8, 7, 6)]
+    triangles, of_faces = fan(faces, {"red": np.array([1, 2, 3, 4])})
+    assert triangles.tolist() == [[4, 5, 6], [0, 1, 2], [9, 8, 7], [0, 2, 3], [9, 7, 6]]
+    assert of_faces["red"].tolist() == [2, 1, 4, 1, 4]
+    assert len(fan([range(300_000)], {})[0]) == 299_998
+    assert fan([(0, 1)], {"red": np.array([1])})[0].shape == (0, 3)
 
 
 def test_a_ply_with_an_empty_face_element_is_a_cloud(tmp_path: Path) -> None:

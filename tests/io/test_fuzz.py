@@ -18,10 +18,12 @@ FOUND = {
 }
 
 
-def test_malformed_files_are_read_or_refused(tmp_path: Path) -> None:
-    total, findings = run(seed=0, count=1500, minutes=None, folder=tmp_path)
+@pytest.mark.parametrize(("seed", "count"), [(0, 200), pytest.param(200, 1300, marks=pytest.mark.slow)])
+def test_malformed_files_are_read_or_refused(tmp_path: Path, seed: int, count: int) -> None:
+    """A few of each format here; the long runs are ``python -m benchmarks.fuzz``."""
+    total, findings = run(seed=seed, count=count, minutes=None, folder=tmp_path)
     assert findings == []
-    assert total == 1500
+    assert total == count
 
 
 def test_the_fuzzer_notices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import random
 import subprocess
-import sys
 import time
 from pathlib import Path
 
+import command
 import numpy as np
 import pytest
 
@@ -19,13 +19,9 @@ resource = pytest.importorskip("resource")  # POSIX
 OLD = b"what was there before"
 
 
-def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "fmr_cli.cli", *map(str, arguments)]
-
-
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two files of many points, and a transform."""
+    """Two files of so many points that writing takes a while, one of few, and a transform."""
     folder = tmp_path_factory.mktemp("scans")
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-20, 20, (2, 300_000))
@@ -33,6 +29,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     intensity = {"intensity": rng.integers(0, 999, len(x)).astype(np.uint16)}
     write_cloud(folder / "a.npz", PointCloud(points, intensity))
     write_cloud(folder / "b.npz", PointCloud(points[::-1], intensity))
+    write_cloud(folder / "few.npz", PointCloud(points, intensity).select(slice(20_000)))
     T = np.eye(4)
     T[:3, 3] = [1, 2, 3]
     write_transform(folder / "T.txt", T)
@@ -54,43 +51,43 @@ def killed_while_writing(arguments: list[str], folder: Path, delay: float) -> bo
     return alive
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".las", ".csv"])
+@pytest.mark.parametrize("suffix", [".ply", *(pytest.param(s, marks=pytest.mark.slow) for s in (".las", ".csv"))])
 def test_transform_is_killed(scans: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"out{suffix}"
     out.write_bytes(OLD)
-    arguments = command("transform", scans / "a.npz", scans / "T.txt", "-o", out)
-    alive = killed_while_writing(arguments, tmp_path, random.Random(suffix).uniform(0, 0.05))
+    arguments = ("transform", scans / "a.npz", scans / "T.txt", "-o", out)
+    alive = killed_while_writing(command.process_of(*arguments), tmp_path, random.Random(suffix).uniform(0, 0.05))
     moved = np.array([1, 2, 3]) + read_cloud(scans / "a.npz").points.mean(0)
     if alive and leftovers(tmp_path):
         assert out.read_bytes() == OLD
     elif alive:  # killed after the whole file had taken its name, before the process ended
         assert read_cloud(out).points.mean(0) == pytest.approx(moved)
-    subprocess.run(arguments, check=True)
+    assert command.here(*arguments).returncode == 0
     assert leftovers(tmp_path) == []
     assert read_cloud(out).points.mean(0) == pytest.approx(moved)
 
 
+@pytest.mark.slow
 def test_merged_is_killed(scans: Path, tmp_path: Path) -> None:
     out, pose = tmp_path / "out.ply", tmp_path / "T.txt"
     out.write_bytes(OLD)
-    arguments = command(
-        "align", scans / "a.npz", scans / "b.npz", "-o", pose, "--init", "identity", "--merged", out, "--quiet"
-    )
-    if killed_while_writing(arguments, tmp_path, 0.02):
+    arguments = ("align", scans / "a.npz", scans / "b.npz", "-o", pose, "--init", "identity", "--merged", out, "-q")
+    if killed_while_writing(command.process_of(*arguments), tmp_path, 0.02):
         assert out.read_bytes() == OLD
-    assert subprocess.run(arguments, check=False).returncode in (0, 3)
+    assert command.here(*arguments).returncode in (0, 3)
     assert leftovers(tmp_path) == []
     assert len(read_cloud(out)) == 600_000
 
 
+@pytest.mark.slow
 def test_a_batch_is_killed_and_goes_on(scans: Path, tmp_path: Path) -> None:
     manifest, out = tmp_path / "pairs.csv", tmp_path / "out"
     rows = "".join(f"{scans}/a.npz,{scans}/b.npz,identity,p{k}\n" for k in range(3))
     manifest.write_text(f"source,target,init,name\n{rows}")
-    arguments = command("batch", manifest, "--out", out, "--aligned", "--workers", 1, "--quiet", "--resume")
+    arguments = ("batch", manifest, "--out", out, "--aligned", "--workers", 1, "--quiet", "--resume")
     out.mkdir()
-    killed_while_writing(arguments, out / "aligned", 0.02)
-    assert subprocess.run(arguments, check=False).returncode in (0, 3)
+    killed_while_writing(command.process_of(*arguments), out / "aligned", 0.02)
+    assert command.here(*arguments).returncode in (0, 3)
     assert leftovers(out) == []
     assert len((out / "results.csv").read_text().splitlines()) == 4
     assert sorted(p.name for p in (out / "aligned").iterdir()) == ["p0.npz", "p1.npz", "p2.npz"]
@@ -100,19 +97,17 @@ def test_a_batch_is_killed_and_goes_on(scans: Path, tmp_path: Path) -> None:
     "suffix", [".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".csv", ".pts", ".ptx", ".e57"]
 )
 def test_a_full_disk(scans: Path, tmp_path: Path, suffix: str) -> None:
-    """A file of more than 1 MB cannot be written: the same as far as a program can tell."""
+    """A file of more than 100 kB cannot be written: the same as far as a program can tell."""
     if suffix == ".e57":
         pytest.importorskip("pye57")
     out = tmp_path / f"out{suffix}"
     out.write_bytes(OLD)
-
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
-
-    done = subprocess.run(
-        command("transform", scans / "a.npz", scans / "T.txt", "-o", out), preexec_fn=limit, capture_output=True,
-        text=True, check=False,
-    )  # fmt: skip
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, unlimited[1]))  # Python ignores the signal: writing fails
+    try:
+        done = command.here("transform", scans / "few.npz", scans / "T.txt", "-o", out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
     assert done.returncode == 2, done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert f"{out}" in done.stderr

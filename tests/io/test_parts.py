@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io import open_cloud, read_cloud, scans_of, write_cloud
+from fmr_cli.io import CloudStream, open_cloud, read_cloud, scan_paths, scans_of, write_cloud
 
 
 def pose(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     T = np.eye(4)
-    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     T[:3, 3] = rng.uniform(-50, 50, 3)
     return T
 
@@ -164,6 +164,19 @@ def test_a_file_of_that_very_name_wins(tmp_path: Path) -> None:
         read_cloud(f"{tmp_path}/a.ply#2")
     with pytest.raises(CloudFileError, match=r"b\.ptx: no such file"):
         read_cloud(f"{tmp_path}/b.ptx#2")
+
+
+def test_every_scan_is_reached_whatever_their_names(tmp_path: Path) -> None:
+    """Names that are numbers of other scans, a # in a name, two of one name."""
+    pytest.importorskip("pye57")
+    names = ["2", "hall#2", "1", "hall#2", "007"]
+    scans = [PointCloud(np.full((1, 3), k), scan=name, T_file_scan=np.eye(4)) for k, name in enumerate(names)]
+    write_cloud(tmp_path / "a.e57", CloudStream(lambda: iter(scans), "made"))
+    assert [read_cloud(path).points[0, 0] for path in scan_paths(tmp_path / "a.e57")] == [0, 1, 2, 3, 4]
+    assert read_cloud(tmp_path / "a.e57#2").scan == "hall#2"  # by its number
+    assert read_cloud(tmp_path / "a.e57#007").scan == "007"
+    with pytest.raises(CloudFileError, match="has 2 scans called 'hall#2', give its number"):
+        read_cloud(tmp_path / "a.e57#hall#2")
 
 
 def test_a_ptx_that_ends_early_or_begins_otherwise(tmp_path: Path) -> None:

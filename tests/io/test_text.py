@@ -24,6 +24,8 @@ DIALECTS = {
     "trailing-comma.csv": ("x,y,z,\n1,2.5,3,\n-4,5,600,\n", {}),
     "tab.txt": ("1\t2.5\t3\n-4\t5\t600\n", {}),
     "tab-empty.txt": ("x\ty\tz\tintensity\n1\t2.5\t3\t\n-4\t5\t600\t7\n", {"intensity": [np.nan, 7]}),
+    "tab-trailing.txt": ("1\t2.5\t3\t\n-4\t5\t600\t\n", {}),
+    "last-empty.csv": ("x;y;z;q\n1;2.5;3;\n-4;5;600;\n", {"q": [np.nan, np.nan]}),
     "pipe.txt": ("X|Y|Z\n1|2.5|3\n-4|5|600\n", {}),
     "decimal-semicolon.csv": ("X;Y;Z;Intensity\n1,0;2,5;3;0,5\n-4;5;600,0;7,25\n", {"intensity": [0.5, 7.25]}),
     "decimal-tab.txt": ("1,0\t2,5\t3,0\n-4,0\t5,0\t600,0\n", {}),
@@ -110,6 +112,8 @@ def test_a_long_file_is_read_as_its_parts(tmp_path: Path) -> None:
     [
         ("lon,lat,alt\n9.1,48.7,300\n", "longitude and latitude, and degrees are no lengths: project it"),
         ("Latitude;Longitude;Height\n48.7;9.1;300\n", "longitude and latitude"),
+        ("0 -1 0 9\n1 0 0 8\n0 0 1 7\n0 0 0 1\n", "holds a 4x4 transform and no points"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 5 0 1 0 0 0 0 1 0\n", "holds poses and no points"),
         ("a,b,c\n1,2,3\n", "line 1: expected numbers, or names of which some are x, y and z"),
         ("1;2;3\n1,234.5;2;3\n", "line 2: '1,234.5' has marks between the thousands"),
         ("1.234,5;2;3\n1;2;3\n", "marks between the thousands"),

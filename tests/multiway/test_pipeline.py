@@ -41,6 +41,7 @@ def test_links_that_hold_agree_with_the_truth(network, room):
         assert link.residual_shift < 0.1
 
 
+@pytest.mark.slow
 def test_the_same_bits_with_one_worker(network, room):
     again = align_many([PointCloud(points) for points in room[0]], workers=1)
     for a, b in zip(network.scans, again.scans, strict=True):
@@ -51,6 +52,7 @@ def test_the_same_bits_with_one_worker(network, room):
     ]
 
 
+@pytest.mark.slow
 def test_scans_of_two_places_are_two_components(room):
     others, _ = room_views(21, 3)
     mixed = [*others[:2], *room[0][:3], others[2]]
@@ -78,6 +80,7 @@ def known_links(network, names, wrong=()):
     return links
 
 
+@pytest.mark.slow
 def test_a_wrong_link_does_no_harm_and_is_named(network, room, worst_error):
     names = [scan.name for scan in network.scans]
     tie = {n: sum(n in x.ends for x in network.links if x.status == "aligned") for n in range(6)}
@@ -93,6 +96,7 @@ def test_a_wrong_link_does_no_harm_and_is_named(network, room, worst_error):
     assert shift < 0.02
 
 
+@pytest.mark.slow
 def test_fixed_scans_stay_and_the_others_come_into_their_frame(room, worst_error):
     clouds, truth = room
     poses = {"cloud_001": KnownPose(truth[1])}
@@ -114,6 +118,7 @@ def test_rough_poses_bound_the_search(room):
     assert np.allclose(found.scans[1].T_component_scan[:3, 3], expected[:3, 3], atol=0.05)
 
 
+@pytest.mark.slow
 def test_bad_scans_among_good_ones_are_rows(room, tmp_path):
     for n in range(3):
         write_cloud(tmp_path / f"{n}.ply", PointCloud(room[0][n]))
@@ -139,6 +144,7 @@ def test_a_bound_on_the_shift_keeps_scans_apart(room):
     assert [scan.component for scan in found.scans] == [None, None]
 
 
+@pytest.mark.slow
 def test_levelled_scans_stay_level(room):
     clouds, truth = room
     level = [x @ T[:3, :3].T + [3.0 * n, 0, 0] for n, (x, T) in enumerate(zip(clouds[:4], truth, strict=False))]

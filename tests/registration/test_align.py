@@ -224,7 +224,7 @@ def test_another_axis_may_be_the_vertical(room_scans: Scans) -> None:
     np.testing.assert_allclose(here.T_target_source[1, :3], [0, 1, 0], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("dof", ["yaw", "translation", "planar"])
+@pytest.mark.parametrize("dof", [*(pytest.param(d, marks=pytest.mark.slow) for d in ("yaw", "translation")), "planar"])
 def test_a_constraint_holds_where_the_data_speak_against_it(turned: tuple[Prepared, Prepared], dof: str) -> None:
     here = align(*turned, Options(dof=dof, init="features"))  # type: ignore[arg-type]
     T = here.T_target_source
@@ -244,12 +244,13 @@ def test_a_shift_alone(room_scans: Scans) -> None:
     assert np.array_equal(here.T_target_source[:3, :3], np.eye(3))
 
 
-def test_one_scale_factor(room_scans: Scans) -> None:
+@pytest.mark.parametrize(("factor", "init"), [(1 / 0.9, "features"), (0.3048, "auto"), (1000.0, "auto")])
+def test_one_scale_factor(room_scans: Scans, factor: float, init: str) -> None:
     truth = ANY.copy()
-    truth[:3, :3] *= 1 / 0.9
+    truth[:3, :3] *= factor
     source = before(truth, room_scans[0])
-    here = align(PointCloud(source), PointCloud(room_scans[1]), Options(scale=True, init="features"))
-    assert here.scale == pytest.approx(1 / 0.9, rel=3e-3)
+    here = align(PointCloud(source), PointCloud(room_scans[1]), Options(scale=True, init=init))
+    assert here.scale == pytest.approx(factor, rel=3e-3)
     assert off(here, truth, source)[1] < 0.06
     assert here.status == "aligned"
 
@@ -284,7 +285,7 @@ def test_whole_clouds_may_start_from_their_centroids(room_scans: Scans) -> None:
     assert here.start == "centroid"
 
 
-@pytest.mark.parametrize("init", ["centroid", "given", "search"])
+@pytest.mark.parametrize("init", ["centroid", "given", pytest.param("search", marks=pytest.mark.slow)])
 def test_a_planar_motion_keeps_the_height_from_any_start(level: tuple[Prepared, Prepared], init: str) -> None:
     start = LEVEL @ pose((9.0, 0.0, 0.0), (0.0, 0.0, 1.0)) if init == "given" else init  # which leaves the plane
     here = align(*level, Options(dof="planar", init=start, points=300))  # type: ignore[arg-type]

@@ -13,6 +13,7 @@ from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration import confidence
 from fmr_cli.registration.agreement import agreement
 from fmr_cli.registration.pipeline import align
+from fmr_cli.registration.verdict_weights import bundled_weights
 
 
 def ball(rng: np.random.Generator, noise: float) -> np.ndarray:
@@ -30,13 +31,13 @@ def evidence(**given: float) -> confidence.Evidence:
     """What a good pose of two rooms has, but for what is given."""
     usual = {
         "explained": 8000, "contradicted": 100, "overlap": 0.9, "explained_share": 0.8, "inlier_rmse": 0.01,
-        "offset": 0.7, "turn": 1.0, "stretch": 0.0, "votes": 200, "repeats": 0.15,
+        "offset": 0.7, "turn": 1.0, "detail": 2000, "stretch": 0.0, "votes": 200, "repeats": 0.15,
     }  # fmt: skip
     return confidence.Evidence(**(usual | given))  # type: ignore[arg-type]
 
 
 def said(*poses: confidence.Evidence) -> list[float]:
-    return confidence.confidences(np.array([e.vector() for e in poses]), confidence.bundled_weights())[0].tolist()
+    return confidence.confidences(np.array([e.vector() for e in poses]), bundled_weights())[0].tolist()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -103,11 +104,25 @@ def test_poses_that_fit_as_well_are_not_sure() -> None:
     {"votes": 15, "explained": 2000, "contradicted": 6000, "offset": 3.5, "explained_share": 0.2},
     {"stretch": 0.04, "offset": 2.0, "contradicted": 2000},
     {"votes": 3, "explained": 500, "contradicted": 800, "offset": 3.0, "explained_share": 0.1},
+    {"contradicted": 9000, "offset": 1.0},
 ])  # fmt: skip
 def test_contradiction_outweighs_matches(against: dict[str, float]) -> None:
     assert said(evidence(**against))[0] < 0.5
 
 
+def test_a_mere_corner_is_not_called_sure_however_well_it_fits() -> None:
+    assert said(evidence(detail=0, votes=400, explained_share=1.0))[0] < 0.5
+    rng = np.random.default_rng(5)
+    sides = rng.integers(3, size=9000)
+    corner = rng.uniform(0, 1, (9000, 3)) * np.where(rng.random((9000, 1)) < 0.5, 1, 0.8)
+    corner[np.arange(9000), sides] = 0
+    truth = pose(50, 0.4)
+    found = align(PointCloud(corner[::2]), PointCloud(transform_points(truth, corner[1::2])))
+    assert found.status == "uncertain"
+    assert any("three planes" in reason for reason in found.reasons)
+
+
+@pytest.mark.slow
 def test_a_box_that_fits_turned_over_is_not_called_sure() -> None:
     rng = np.random.default_rng(1)
     sides = np.array([1.0, 0.6, 0.35])

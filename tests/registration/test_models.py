@@ -33,9 +33,10 @@ def test_one_file_holds_both_encoders_and_the_verdict_and_registration_uses_all(
     from fmr_cli.io import read_cloud
     from fmr_cli.io.weights import weights_bytes
     from fmr_cli.registration import Options, prepare
-    from fmr_cli.registration.confidence import Judge, bundled_weights
+    from fmr_cli.registration.confidence import Judge
     from fmr_cli.registration.models import model
     from fmr_cli.registration.pair import make_pair
+    from fmr_cli.registration.verdict_weights import bundled_weights
 
     given = {f: np.asarray(v).tolist() for f, v in vars(bundled_weights()).items()}
     given["verdict"][0] += 1.0
@@ -79,3 +80,14 @@ def test_patches_of_another_encoder_are_one_line(tmp_path: Path) -> None:
 def scan_pair_files() -> tuple[Path, Path]:
     samples = Path(__file__).parents[2] / "samples"
     return samples / "scan_a.ply", samples / "scan_b.ply"
+
+
+def test_a_calibration_of_another_version_s_evidence_gives_way_to_the_bundled_one() -> None:
+    from fmr_cli.registration.verdict_weights import bundled_weights, usable
+
+    given = {name: values.tolist() for name, values in vars(bundled_weights()).items()}
+    own = usable(given | {"fit": [1.0, 2.0, 3.0], "made by": "hand"})
+    assert own.fit.tolist() == [1, 2, 3]
+    lacking = {name: values for name, values in given.items() if name != "mean"}
+    for other in (None, {}, lacking, given | {"fit": [1.0, 2.0]}):
+        assert usable(other) is bundled_weights()

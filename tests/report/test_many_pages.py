@@ -207,6 +207,22 @@ def test_an_evaluation(tmp_path):
     assert line["high"][0] == 1.0
 
 
+def test_an_evaluation_of_cross_source_pairs_shows_the_verdict_and_no_empty_columns(tmp_path):
+    from fmr_cli.evaluation.experiments import Row
+    from fmr_cli.report.evaluation_page import write_evaluation
+
+    rows = [Row("cross-source", "onto a laser", "a", level, 10, share, 1, 1, 0.1, 0.1, 0.1, 0.1, 0.01,
+                scale_median=0.02, aligned_right=share, aligned_wrong=0.1)
+            for level, share in ((0.5, 0.9), (1.0, 0.5))]  # fmt: skip
+    write_evaluation(tmp_path / "e.html", rows, {"pairs": 10})
+    text = (tmp_path / "e.html").read_text("utf-8")
+    assert "Aligned, wrong" in text
+    assert "Times the limit" not in text
+    plots = data_of(text)["groups"][0]["plots"]
+    assert [p["series"][0]["values"] for p in plots] == [[0.9, 0.5], [0.02, 0.02], [0.9, 0.5], [0.1, 0.1]]
+    assert plots[3]["series"][0]["high"][0] > 0.1
+
+
 def test_a_data_set(tmp_path):
     from fmr_cli.evaluation.benchmark import Outcome, Summary
     from fmr_cli.evaluation.quoted import Quoted

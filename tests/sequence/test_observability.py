@@ -98,6 +98,7 @@ def test_a_camera_that_pans_past_a_blank_wall_is_right_or_says_so():
     assert shift.max() < 0.1
 
 
+@pytest.mark.slow
 def test_the_cases_of_the_shared_data(shared_data):
     cases = shared_data / "cases" / "sequences"
     found = align_sequence(cases / "pan")

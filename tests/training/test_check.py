@@ -10,7 +10,6 @@ import pytest
 from fmr_cli.io import read_cloud
 from fmr_cli.io.weights import weights_bytes
 from fmr_cli.registration import prepare
-from fmr_cli.registration.confidence import weights_of
 from fmr_cli.registration.models import model
 from fmr_cli.training.check import Checked, CheckPair, Outcome, compare, decide, holds, in_line, in_turn, rows
 
@@ -56,7 +55,7 @@ def test_a_verdict_that_is_too_sure_is_brought_in_line(path):
     assert "brought in line" in " ".join(decision.said)
     assert decision.kept
     path.write_bytes(decision.replaced)
-    assert weights_of(path).verdict[0] < weights_of(None).verdict[0]
+    assert model(path).verdict.verdict[0] < model().verdict.verdict[0]
     assert np.array_equal(model(path).local.head[0][0], model().local.head[0][0])
 
 

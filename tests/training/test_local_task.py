@@ -84,6 +84,7 @@ def test_training_starts_from_the_bundled_weights_and_is_better_than_nothing(mat
     assert bundled.quality(bundled.test()) > untrained.quality(untrained.test())
 
 
+@pytest.mark.slow
 def test_a_run_learns_and_its_best_is_kept(tmp_path, material):
     recipe = TINY.changed(steps=60, epoch_steps=30)
     rows = finish(Trainer(LocalTask(recipe, material, CPU, None), tmp_path))

@@ -33,7 +33,7 @@ def whole(tmp_path_factory, tiny, data):
     return folder, finish(trainer), trainer
 
 
-@pytest.mark.parametrize("steps_before_the_end", [3, 4, 5])
+@pytest.mark.parametrize("steps_before_the_end", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 5))])
 def test_a_run_that_ends_anywhere_goes_on_to_the_same_numbers(tmp_path, tiny, data, whole, steps_before_the_end):
     folder, rows, _ = whole
     for report in Trainer(GlobalTask(tiny, data, None), tmp_path).run():

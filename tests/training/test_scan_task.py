@@ -22,7 +22,8 @@ from fmr_cli.synthetic import scenes
 from fmr_cli.training.local_views import PATCH_RADIUS, aliases
 from fmr_cli.training.loop import Trainer
 from fmr_cli.training.recipe import ScanRecipe
-from fmr_cli.training.scan_task import ROUNDS, ScanTask, held_out, local_start, read_rounds
+from fmr_cli.training.scan_material import ROUNDS, held_out, read_rounds
+from fmr_cli.training.scan_task import ScanTask, local_start
 from fmr_cli.training.scan_views import (
     Overlapping,
     drawn_views,
@@ -68,7 +69,7 @@ def files(room, tmp_path_factory) -> tuple[list[Scan], list[np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def found(files):
-    return register_scans(files[0], list(range(5)), None, 12, 0)
+    return register_scans(files[0][:4], list(range(4)), None, 12, 0)
 
 
 def test_scans_register_themselves_and_every_pair_of_a_part_has_a_pose(files, found):
@@ -107,6 +108,7 @@ def test_a_wrong_link_that_is_not_sure_joins_nothing():
         np.testing.assert_allclose(T, np.linalg.inv(poses[0]) @ poses[i], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_scans_that_share_nothing_and_broken_files_are_said(tmp_path, files):
     rng = np.random.default_rng(0)
     (tmp_path / "broken.ply").write_text("ply\nnothing")
@@ -208,6 +210,7 @@ def finish(trainer: Trainer) -> list[str]:
     return [note for report in trainer.run() for note in report.notes]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_in_its_second_round_goes_on_to_the_same_weights(tmp_path, files):
     whole = trainer(files, tmp_path / "whole")
     notes = finish(whole)
@@ -223,22 +226,24 @@ def test_a_run_that_is_killed_in_its_second_round_goes_on_to_the_same_weights(tm
 
 
 def test_the_file_is_a_whole_model(tmp_path, files):
-    run = trainer(files, tmp_path, rounds=1)
+    run = trainer((files[0][:3], files[1]), tmp_path, rounds=1)
     finish(run)
     kept = model(tmp_path / "model.safetensors")
     assert np.array_equal(kept.whole.layers[0][0], model().whole.layers[0][0])
     assert kept.local.key == model().local.key or run.progress.best > 0
     text = "\n".join(run.task.card())
     assert "Round 1" in text
-    assert not run.task.held_out & {n for p in run.task.rounds[0].pairs if run.task.trains(p) for n in p.ends}
+    material = run.task.material
+    assert not material.held_out & {n for p in material.rounds[0].pairs if material.trains(p) for n in p.ends}
 
 
+@pytest.mark.slow
 def test_one_scan_alone_learns_from_its_parts(tmp_path, files):
     task = ScanTask(replace(TINY, rounds=1, steps=2), files[0][:1], CPU, None, None)
     notes = finish(Trainer(task, tmp_path))
     assert "one scan" in notes[0]
-    assert task.views["single"]
-    assert task.tests["held-out scans"]
+    assert task.material.views["single"]
+    assert task.material.tests["held-out scans"]
 
 
 def test_forgetting_counts_as_no_gain(files):

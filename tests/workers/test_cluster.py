@@ -27,6 +27,7 @@ from fmr_cli.batch import align_batch  # noqa: E402
 from fmr_cli.cli.app import main  # noqa: E402
 from fmr_cli.errors import FmrError  # noqa: E402
 from fmr_cli.multiway import align_many  # noqa: E402
+from fmr_cli.multiway.export import write_network  # noqa: E402
 from fmr_cli.workers import DaskWorkers, cluster, handing  # noqa: E402
 from fmr_cli.workers.base import LostError  # noqa: E402
 
@@ -97,6 +98,7 @@ def test_a_client_that_is_given_stays_open(shared):
         assert client.status == "running"
 
 
+@pytest.mark.slow
 def test_a_file_that_one_worker_does_not_see(shared, tmp_path):
     """The third worker has an empty folder in the place of ours."""
     (tmp_path / "scan.ply").write_text("")
@@ -121,6 +123,7 @@ def table(out: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
     """Of four workers one is killed and one stopped; the run is cut off, and gone on with by processes.
 
@@ -158,23 +161,61 @@ def test_a_batch_whose_workers_are_killed_and_stopped_gives_the_same_files(share
             assert (tmp_path / "dask" / file).read_bytes() == (tmp_path / "here" / file).read_bytes()
 
 
-def test_a_network_is_the_same(shared, tmp_path):
-    """Three scans, of which one is a moved copy of the first one's other points."""
-    a, b = (read_cloud(SAMPLES / f"scan_{name}.ply").select(slice(None, None, 10)) for name in "ab")
+@pytest.mark.slow
+def test_a_worker_whose_disk_is_full_is_left_out(shared, tmp_path):
+    """One worker may write no file of more than 512 bytes: the same as far as it can tell."""
+    cloud = read_cloud(SAMPLES / "scan_a.ply").select(slice(None, None, 8))
+    write_cloud(tmp_path / "a.ply", cloud)
+    (tmp_path / "pairs.csv").write_text("source,target,init\n" + 6 * "a.ply,a.ply,identity\n")
+    full, said = shared.worker(prefix=("sh", "-c", 'ulimit -f 1 && exec "$@"', "sh")), []
+    try:
+        with DaskWorkers(shared.address, say=said.append) as workers:
+            have(workers, 3)
+            rows = align_batch(tmp_path / "pairs.csv", tmp_path / "out", aligned=True, workers=workers)
+    finally:
+        full.kill()
+    assert [row["status"] for row in rows] == 6 * ["aligned"]
+    assert len([*(tmp_path / "out" / "aligned").iterdir()]) == 6
+    assert any("left out" in line and "cannot be written (File too large)" in line for line in said)
+
+
+@pytest.mark.slow
+def test_a_network_whose_workers_are_killed_and_stopped_gives_the_same_files(shared, tmp_path):
+    """Four scans, of which two are moved copies of the others' other points; one worker is killed, one stopped."""
     T = np.array([[0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1.0]])
-    c = read_cloud(SAMPLES / "scan_a.ply").select(slice(3, None, 10)).transformed(T)
-    for name, cloud in zip("abc", (a, b, c), strict=True):
-        write_cloud(tmp_path / f"{name}.ply", cloud)
-    scans = [tmp_path / f"{name}.ply" for name in "abc"]
+    scans = []
+    for name, moved in (("a", "c"), ("b", "d")):
+        cloud = read_cloud(SAMPLES / f"scan_{name}.ply")
+        scans += [tmp_path / f"{name}.ply", tmp_path / f"{moved}.ply"]
+        write_cloud(scans[-2], cloud.select(slice(None, None, 10)))
+        write_cloud(scans[-1], cloud.select(slice(3, None, 10)).transformed(T))
+    killed, stopped = shared.worker(), shared.worker()
+    harmed = []
+
+    def harm(now):
+        if now.stage == "registering" and now.done == 1 and not harmed:
+            killed.kill()
+            stop(stopped)
+            harmed.append(now.total)
+
     with DaskWorkers(shared.address, say=lambda _: None) as workers:
-        have(workers, 2)
-        there = align_many(scans, workers=workers)
+        have(workers, 4)
+        there = align_many(scans, workers=workers, progress=harm)
+    stopped.kill()
     here = align_many(scans, workers=2)
-    assert len(here.links) == 3
-    assert np.array_equal([s.T_component_scan for s in here.scans], [s.T_component_scan for s in there.scans])
-    assert [link.confidence for link in here.links] == [link.confidence for link in there.links]
+    assert harmed[0] > 1
+    assert len(here.links) == 6
+    found = []
+    for name, network in (("there", there), ("here", here)):
+        (tmp_path / name).mkdir()
+        write_network(network, tmp_path / name)
+        files = {file.relative_to(tmp_path / name): file for file in (tmp_path / name).rglob("*.*")}
+        found.append({path: file.read_bytes() for path, file in files.items() if path.name != "network.json"})
+    assert len(found[0]) == 4 + 6 + 3  # poses, links, tables and graph
+    assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path, monkeypatch, capsys):
     found = []
     experiment = ["--no-align", "--experiments", "noise", "--pairs", "2", "--points", "64"]
@@ -192,6 +233,7 @@ def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path,
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
     for _ in range(4):
         shared.worker()
@@ -201,6 +243,7 @@ def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
     assert [a for a in answers if not isinstance(a, LostError)] == [0, 1, 2, 4, 5]
 
 
+@pytest.mark.slow
 def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monkeypatch):
     with Cluster(tmp_path) as alone:
         monkeypatch.setattr(cluster, "NO_WORKERS", 0.5)

@@ -17,7 +17,7 @@ from fmr_cli.cloud import transform_points
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.evaluation.datasets.pair import DataSet, Loaded, Pair, Within
 from fmr_cli.io import SUFFIXES, read_cloud, read_poses, read_transform
-from fmr_cli.multiway.scans import natural
+from fmr_cli.io.folders import natural
 from fmr_cli.synthetic.sensors import overlap
 
 POSE = ".pose.txt"
