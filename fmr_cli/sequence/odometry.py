@@ -53,7 +53,7 @@ MATTERS = 0.5
 # Voxels along an unobserved direction, to either side: from there starts find back to one pose, to within SAME voxels,
 # where more shows it than normals tell, as trunks and leaves do. In tunnels and before blank walls they stay where they
 # are. HINTED: of the information along it, what must be real all the same.
-ASIDE, SAME, HINTED = 2.0, 0.1, 0.25
+ASIDE, SAME, HINTED = 2.0, 0.1, 0.35
 ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
