@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from fmr_cli.cli.console import UNCERTAIN, busy, progress, say, show_log
-from fmr_cli.cli.options import Quiet, Report, Topic, Verbose, check_report
+from fmr_cli.cli.options import Quiet, Report, Topic, Verbose, check_report, takes_registration_options
+from fmr_cli.registration.options import Options
 
 if TYPE_CHECKING:
     import numpy as np
     from rich.progress import Progress
 
 
+@partial(takes_registration_options, names=("model",))
 def sequence_command(
     scans: Annotated[
         Path,
@@ -24,6 +27,7 @@ def sequence_command(
             help="A folder of scans, a KITTI sequence or drive, a bag, or a list (.txt).", show_default=False
         ),
     ],
+    options: Options,
     out: Annotated[
         Path, typer.Option("-o", "--out", help="The poses, each frame to the first, in the sensor's frame.")
     ],
@@ -78,21 +82,21 @@ def sequence_command(
     found = find_scans(with_topic(scans, topic), start, stop, step, [path for path in (out, residuals, merged) if path])
     say(*found.notes, quiet=quiet)
     true = read_truth(truth, found) if truth else None
-    options = SequenceOptions(
+    chosen = SequenceOptions(
         format=form, camera_frame=camera_frame, voxel_size=voxel_size or None, merged_voxel=merged_voxel or None,
-        loop_closure=loop_closure, deskew=deskew,
+        loop_closure=loop_closure, deskew=deskew, model=options.model,
     )  # fmt: skip
     told = read_init_poses(init_poses) if init_poses else None
     with progress(quiet) as bar:
         result = align_sequence(
-            found, out, options, init_poses=told, known_map=known_map, residuals=residuals, merged=merged,
+            found, out, chosen, init_poses=told, known_map=known_map, residuals=residuals, merged=merged,
             resume=resume, on_row=follow(bar, quiet),
         )  # fmt: skip
     if report:
         with busy("writing the report", quiet):
             from fmr_cli.report.sequence_page import write_sequence
 
-            write_sequence(report, result, found, options)
+            write_sequence(report, result, found, chosen)
     say(*result.summary(), quiet=quiet)
     if true is not None:
         compare(result.poses, true, out, quiet)

@@ -11,6 +11,7 @@ import small_gicp
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.voxels import voxel_keys
+from fmr_cli.registration.options import Options
 from fmr_cli.sequence.prepared_scan import NEIGHBOURS, PreparedScan
 
 if TYPE_CHECKING:
@@ -49,11 +50,11 @@ class KnownMap:
 
         return prepare(PointCloud(self.points))
 
-    def locate(self, scan: PreparedScan) -> tuple[np.ndarray | None, str]:
+    def locate(self, scan: PreparedScan, pair: Options) -> tuple[np.ndarray | None, str]:
         """T_map_scan (4, 4) by ``align``, or None where its verdict is not "aligned"; and why."""
         from fmr_cli.registration import align
 
-        found = align(scan.for_align, self.for_align, hints=False)
+        found = align(scan.for_align, self.for_align, pair, hints=False)
         if found.status != "aligned":
             return None, "; ".join(found.reasons) or f"confidence {found.confidence:.2f}"
         return found.T_target_source, ""

@@ -143,10 +143,13 @@ class LocalMap:
         return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms, seen=seen), slope
 
     def _seen(self, scan: PreparedScan, T_map_scan: np.ndarray, matches: Matches) -> Observability:
-        some = scan.points[::EVERY]
-        moved = min((displacement(T_map_scan, k.T_map_scan, some) for k in self.keyframes), default=np.inf)
-        wrong = WRONG_STANDING if moved < STANDING else WRONG
+        wrong = WRONG_STANDING if self.moved(scan, T_map_scan) < STANDING else WRONG
         return clearly_observed(matches, wrong) or observe(matches, scan.trust[matches.index], wrong)
+
+    def moved(self, scan: PreparedScan, T_map_scan: np.ndarray) -> float:
+        """Voxels, on average, from where the nearest of the keyframes stood."""
+        some = scan.points[::EVERY]
+        return min((displacement(T_map_scan, k.T_map_scan, some) for k in self.keyframes), default=np.inf)
 
 
 def displacement(T_map_a: np.ndarray, T_map_b: np.ndarray, points: np.ndarray) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 from fmr_cli.multiway import looks
 from fmr_cli.multiway.pose_graph import adjoint, bounded, prior_factor, symmetric
 from fmr_cli.registration.models import local_encoder
+from fmr_cli.registration.options import Options
 from fmr_cli.sequence.local_map import COARSE, FINE, LocalMap, displacement
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
@@ -49,19 +50,20 @@ class Loop:
 
 
 def close_loops(
-    poses: np.ndarray, sure: np.ndarray, load: Callable[[int], PreparedScan]
+    poses: np.ndarray, sure: np.ndarray, load: Callable[[int], PreparedScan], pair: Options = Options()
 ) -> tuple[np.ndarray, list[Loop]]:
     """Poses (n, 4, 4) with their loops closed, and the loops.
 
     sure: (n,), False where a pose is no more than a prediction. load: gives a frame's scan.
+    pair: how two of them are registered.
     """
     keys = keyframes(poses, sure)
     path = path_lengths(poses)
     load = lru_cache(maxsize=4 * NEIGHBOURS + 2)(load)
     near = candidates(poses, keys)
-    loops = proved(near, poses, keys, load, expected=True)
-    alike = [pair for pair in lookalikes(path, keys, load) if pair not in near]
-    loops += proved(alike, poses, keys, load, expected=False)
+    loops = proved(near, poses, keys, load, pair, expected=True)
+    alike = [pair for pair in lookalikes(path, keys, load, pair) if pair not in near]
+    loops += proved(alike, poses, keys, load, pair, expected=False)
     loops = [loop for loop in loops if loop.expected or confirmed(loop, loops, poses, path)]
     while loops:
         closed = optimise(poses, sure, loops)
@@ -102,13 +104,15 @@ def candidates(poses: np.ndarray, keys: list[int]) -> list[tuple[int, int]]:
     return found
 
 
-def lookalikes(path: np.ndarray, keys: list[int], load: Callable[[int], PreparedScan]) -> list[tuple[int, int]]:
+def lookalikes(
+    path: np.ndarray, keys: list[int], load: Callable[[int], PreparedScan], pair: Options
+) -> list[tuple[int, int]]:
     """Keyframes far apart along the path that look most like one place, as places in ``keys``: (earlier, later)."""
     if len(keys) < 2:
         return []
     from fmr_cli.geometry.motion import Motion
 
-    described = [looks.describe(load(key).for_align, EDGE, local_encoder()) for key in keys]
+    described = [looks.describe(load(key).for_align, EDGE, local_encoder(pair.model)) for key in keys]
     alike = looks.similarity(described)
     found = []
     for later in range(1, len(keys)):
@@ -122,7 +126,7 @@ def lookalikes(path: np.ndarray, keys: list[int], load: Callable[[int], Prepared
 
 def proved(
     pairs: list[tuple[int, int]], poses: np.ndarray, keys: list[int], load: Callable[[int], PreparedScan],
-    *, expected: bool,
+    pair: Options, *, expected: bool,
 ) -> list[Loop]:  # fmt: skip
     """The loops among pairs of places in ``keys``, each (earlier, later), in the order of the later one."""
     loops: list[Loop] = []
@@ -130,7 +134,7 @@ def proved(
     for earlier, later in pairs:
         if later - last <= REST:
             continue
-        loop = verify(poses, keys, earlier, later, load, expected)
+        loop = verify(poses, keys, earlier, later, load, pair, expected)
         if loop is not None:
             loops.append(loop)
             last = later
@@ -138,8 +142,9 @@ def proved(
 
 
 def verify(
-    poses: np.ndarray, keys: list[int], earlier: int, later: int, load: Callable[[int], PreparedScan], expected: bool
-) -> Loop | None:
+    poses: np.ndarray, keys: list[int], earlier: int, later: int, load: Callable[[int], PreparedScan], pair: Options,
+    expected: bool,
+) -> Loop | None:  # fmt: skip
     """The loop of two keyframes, or None where registration does not say surely that they show one place.
 
     Where the path comes near itself there, the loop must also lie within what the path may have drifted.
@@ -147,7 +152,7 @@ def verify(
     from fmr_cli.registration import align
 
     scan = load(keys[later])
-    found = align(scan.for_align, load(keys[earlier]).for_align, hints=False)
+    found = align(scan.for_align, load(keys[earlier]).for_align, pair, hints=False)
     if found.status != "aligned":
         return None
     T_earlier_map = np.linalg.inv(poses[keys[earlier]])

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fmr_cli.geometry.point_to_plane import linearise
+from fmr_cli.geometry.point_to_plane import linearise, step_motion
 
 # Of a direction's information, what must be real for it to count as observed: more than is not.
 RELIABLE = 0.5
@@ -77,6 +77,12 @@ class Observability:
     def as_observed(self) -> Observability:
         """The same where something else has shown that all directions are observed."""
         return replace(self, reliability=np.maximum(self.reliability, RELIABLE))
+
+    def aside(self, T_map_scan: np.ndarray, distance: float) -> list[np.ndarray]:
+        """Poses (4, 4) that move the points by ``distance`` (RMS) along each unobserved direction, to either side."""
+        steps = self.directions[:, ~self.observed]
+        steps = steps * distance / np.sqrt(self.radius**2 * (steps[:3] ** 2).sum(0) + (steps[3:] ** 2).sum(0))
+        return [step_motion(side * step, self.centre) @ T_map_scan for step in steps.T for side in (1, -1)]
 
     @property
     def unobserved(self) -> list[str]:

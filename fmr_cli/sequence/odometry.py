@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fmr_cli.errors import RegistrationError
+from fmr_cli.registration.options import Options
 from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
@@ -49,6 +50,10 @@ FINEST = 0.05
 # Voxels: an unobserved direction whose sigma is beyond it could matter. Half the voxel that everything here is measured
 # by: 0.05 m for a depth camera in a room, 0.2 m for a LiDAR in a street.
 MATTERS = 0.5
+# Voxels along an unobserved direction, to either side: from there starts find back to one pose, to within SAME voxels,
+# where more shows it than normals tell, as trunks and leaves do. In tunnels and before blank walls they stay where they
+# are. HINTED: of the information along it, what must be real all the same.
+ASIDE, SAME, HINTED = 2.0, 0.1, 0.35
 ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
@@ -79,10 +84,13 @@ class Frame:
 
 
 class Odometry:
-    """Registers scans, in their order, into the frame of the first one, or into that of a known map."""
+    """Registers scans, in their order, into the frame of the first one, or into that of a known map.
 
-    def __init__(self, frame: VoxelFrame, known: KnownMap | None = None) -> None:
-        self.frame, self.known = frame, known
+    pair: how a scan is registered onto the one before it, or found in the known map.
+    """
+
+    def __init__(self, frame: VoxelFrame, known: KnownMap | None = None, pair: Options = Options()) -> None:
+        self.frame, self.known, self.pair = frame, known, pair
         self.map = LocalMap(known)
         self.motion: MotionModel | None = None  # from the first scan on
         self.last: tuple[int, PreparedScan, np.ndarray]  # index, scan, T_map_scan: the last one that could be used
@@ -114,7 +122,7 @@ class Odometry:
         else:
             frame = self._bridge(index, scan, expected, fit)
         T_last_scan = np.linalg.inv(T_map_last) @ self.motion.T_map_scan
-        return replace(frame, feature_errors=feature_errors(last, scan, T_last_scan))
+        return replace(frame, feature_errors=feature_errors(last, scan, T_last_scan, self.pair.model))
 
     def begin_in_map(self, scan: PreparedScan | None, T_map_guess: np.ndarray | None) -> Frame:
         """The first frame, in the known map: near a guess (4, 4), or found by registration.
@@ -127,7 +135,7 @@ class Odometry:
     def _place(self, scan: PreparedScan, T_map_guess: np.ndarray | None) -> np.ndarray:
         assert self.known
         if T_map_guess is None:
-            T_map_guess, why = self.known.locate(scan)
+            T_map_guess, why = self.known.locate(scan, self.pair)
             if T_map_guess is None:
                 raise RegistrationError(f"is not found in the map ({why}); give its pose with --init-poses")
         fit = self.map.fit(scan, T_map_guess, (WIDE, COARSE, FINE), "given")
@@ -180,10 +188,10 @@ class Odometry:
 
     def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
-        from fmr_cli.registration import Options, align
+        from fmr_cli.registration import align
 
         _, last, T_map_last = self.last
-        found = align(scan.for_align, last.for_align, Options(init="features"), hints=False)
+        found = align(scan.for_align, last.for_align, replace(self.pair, init="features"), hints=False)
         return found, T_map_last @ found.T_target_source
 
     def _fits(self, fit: Fit) -> bool:
@@ -207,8 +215,9 @@ class Odometry:
     def _polished(self, scan: PreparedScan, fit: Fit, expected: Expected) -> Fit:
         """The fit's exact pose; along directions that are not observed, the prediction's.
 
-        Three things can show that such a direction is observed after all: a pose further off fits and is observed in
-        all directions; the scan does not fit at the prediction; or there all of it is observed.
+        Four things can show that such a direction is observed after all: a pose further off fits and is observed in
+        all directions; starts on either side find back to one pose; the scan does not fit at the prediction; or there
+        all of it is observed.
         """
         assert self.motion
         usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
@@ -224,6 +233,9 @@ class Odometry:
         if elsewhere is not None:
             return elsewhere
         held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, expected, fit.seen))
+        between = self._found_from_both_sides(scan, held, usual_slope)
+        if between is not None:
+            return between
         there, _ = self.map.polish(scan, held, usual_slope)
         if there.seen is None:
             return replace(held, seen=fit.seen)
@@ -236,15 +248,43 @@ class Odometry:
     def _observed_elsewhere(self, scan: PreparedScan, fit: Fit, expected: Expected, slope: float) -> Fit | None:
         """A pose found from further off that fits about as well and leaves nothing open.
 
-        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing.
+        A scanner's rings on the ground hold a scan where it was, where what faces its motion fits nothing. The first
+        motion of all, or one after a gap, may be further than any level of the map reaches: where the fit is not as
+        good as usual, the scan before is asked.
         """
-        other = self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)
-        if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
+        others = [self.map.fit(scan, expected.T_map_scan, (WIDE, COARSE, FINE), fit.start)]
+        if not expected.told and not (self.usual and self._usual(fit)):
+            found, T_map_features = self._by_features(scan)
+            if found.status == "aligned":
+                others.append(self.map.fit(scan, T_map_features, (COARSE, FINE), "features"))
+        for other in others:
+            if not self._fits(other) or other.total > ABOUT_AS_WELL * fit.total:
+                continue
+            if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
+                continue
+            other, _ = self.map.polish(scan, other, slope)
+            if other.seen is not None and other.seen.observed.all():
+                return other
+        return None
+
+    def _found_from_both_sides(self, scan: PreparedScan, held: Fit, slope: float) -> Fit | None:
+        """The one pose to which starts ASIDE of the prediction along every unobserved direction come back.
+
+        Not where a keyframe stood: the scanner's own pattern brings a scan back to there.
+        """
+        assert held.seen
+        found: Fit | None = None
+        for start in held.seen.aside(held.T_map_scan, ASIDE):
+            fit = self.map.fit(scan, start, (COARSE, FINE), held.start)
+            fit, _ = self.map.polish(scan, fit, slope)
+            if fit.seen is None or fit.seen.reliability.min() < HINTED or not self._fits(fit):
+                return None
+            if displacement(fit.T_map_scan, (found or fit).T_map_scan, scan.points) > SAME:
+                return None
+            found = found or fit
+        if found is None or found.seen is None or self.map.moved(scan, found.T_map_scan) < FINE:
             return None
-        if displacement(other.T_map_scan, fit.T_map_scan, scan.points) < FINE:
-            return None
-        other, _ = self.map.polish(scan, other, slope)
-        return other if other.seen is not None and other.seen.observed.all() else None
+        return replace(found, seen=found.seen.as_observed())
 
     def _accept(self, index: int, scan: PreparedScan, expected: Expected, fit: Fit) -> None:
         """Take the fit as the pose, and the scan into the map where it has moved on or the map has grown stale."""
@@ -279,7 +319,7 @@ class Odometry:
         assert self.motion
         T_map_scan = self.motion.T_map_scan
         if self.known:
-            found, _ = self.known.locate(scan)
+            found, _ = self.known.locate(scan, self.pair)
             T_map_scan = T_map_scan if found is None else found
         self.map, self.uncertain, self.best_total = LocalMap(self.known), 0, np.inf
         self.map.insert(index, scan, T_map_scan)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, get_args
 
 from fmr_cli.errors import FmrError
+from fmr_cli.registration.options import Options
 
 Format = Literal["kitti", "tum", "json"]
 FORMATS = get_args(Format)
@@ -22,6 +24,7 @@ class SequenceOptions:
     loop_closure: at the end, recognise places seen before and optimise the pose graph.
     deskew: undo the motion within each scan, by the times of its points; its pose is that of the middle of the scan.
     None: where the first scan's points have times.
+    model: what ``fmr train`` has learnt (.safetensors), for the pairs that are registered on the way; None: bundled.
     Raises FmrError for a format that is not known, and for a voxel edge that is no positive number.
     """
 
@@ -31,6 +34,7 @@ class SequenceOptions:
     merged_voxel: float | None = None
     loop_closure: bool = False
     deskew: bool | None = None
+    model: Path | None = None
 
     def __post_init__(self) -> None:
         if self.format not in FORMATS:
@@ -39,3 +43,8 @@ class SequenceOptions:
             edge = getattr(self, name)
             if edge is not None and not (math.isfinite(edge) and edge > 0):
                 raise FmrError(f"{name} {edge}: must be more than 0, or left out to follow from the scans")
+
+    @property
+    def pair(self) -> Options:
+        """How two scans, or a scan and a map, are registered where the motion alone does not do."""
+        return Options(model=self.model)

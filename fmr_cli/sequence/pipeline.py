@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
@@ -23,6 +23,7 @@ from fmr_cli.errors import CloudFileError, FmrError, RegistrationError
 from fmr_cli.io import read_cloud
 from fmr_cli.multiway.known import KnownPose
 from fmr_cli.multiway.pose_graph import check_installed
+from fmr_cli.registration.models import model
 from fmr_cli.sequence.deskew import scan_times
 from fmr_cli.sequence.journal import Beginning, Journal
 from fmr_cli.sequence.known_map import KnownMap
@@ -36,6 +37,8 @@ from fmr_cli.sequence.priors import Priors
 from fmr_cli.sequence.result import SequenceResult
 from fmr_cli.sequence.scans import Scans, as_scans
 from fmr_cli.sequence.voxel_frame import VoxelFrame
+
+VOXEL_SCANS = 5  # that the working voxel follows from: a first scan may stand in a narrow place, or before a wall
 
 OnRow = Callable[[dict[str, Any], int, int], None]
 
@@ -73,7 +76,7 @@ def align_sequence(
         scans, beginning, poses, deskewed=bool(options.deskew), strict=strict, keep_clouds=merged is not None
     )
     known = KnownMap((known_cloud.points - beginning.frame.of_map) / beginning.frame.voxel) if known_cloud else None
-    odometry, priors = Odometry(beginning.frame, known), Priors(scans, init_poses or {}, beginning.frame)
+    odometry, priors = Odometry(beginning.frame, known, options.pair), Priors(scans, init_poses or {}, beginning.frame)
     go_on(done, rows, poses, loader, odometry)
 
     files = Outputs(
@@ -97,7 +100,7 @@ def align_sequence(
 
         path, loops = np.stack(poses), tuple[tuple[int, int], ...]()
         if options.loop_closure:
-            path, loops = close(path, rows, beginning.frame, loader)
+            path, loops = close(path, rows, beginning.frame, loader, options)
         before = files.written(np.stack(poses)) if options.loop_closure else None
         result = SequenceResult(files.written(path), rows, beginning.frame.voxel, before, len(loops), out, loops)
         files.finish(result, path, loader)
@@ -110,6 +113,7 @@ def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool
         raise FmrError(f"{scans.where(0)}: no calib.txt with a line Tr beside it, leave out --camera-frame")
     if options.loop_closure and known_map:
         raise FmrError("--loop-closure: poses in a known map don't drift, leave out one of them")
+    model(options.model)  # read before anything else is, so that a file that does not fit is said at once
     if options.loop_closure:
         check_installed("--loop-closure")
     if resume and (out is None or any(scans.path(i) is None for i in range(len(scans)))):
@@ -137,6 +141,7 @@ def settings(
         "files": [scans.where(index) for index in range(len(scans))],
         "voxel_size": options.voxel_size,
         "deskew": options.deskew,
+        "model": str(options.model) if options.model else None,
     }
 
 
@@ -150,13 +155,20 @@ def begin(scans: Scans, options: SequenceOptions, known_map: PointCloud | None) 
         scan_times(cloud)  # says before anything is written that points have no times
     origin = np.median(cloud.points, axis=0)
     map_origin = np.median(known_map.points, axis=0) if known_map else origin
-    frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size), origin, map_origin)
-    return Beginning(frame, first_motion(scans, frame) if options.deskew else np.eye(4))
+    frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size, some_later(scans)), origin, map_origin)
+    return Beginning(frame, first_motion(scans, frame, options) if options.deskew else np.eye(4))
 
 
-def first_motion(scans: Scans, frame: VoxelFrame) -> np.ndarray:
+def some_later(scans: Scans) -> Iterator[np.ndarray]:
+    """The points (N, 3) of a few scans over the whole sequence; those that cannot be read are bridged later on."""
+    for index in sorted({len(scans) * part // VOXEL_SCANS for part in range(1, VOXEL_SCANS)} - {0}):
+        with suppress(CloudFileError):
+            yield scans.read(index, attributes=False).points
+
+
+def first_motion(scans: Scans, frame: VoxelFrame, options: SequenceOptions) -> np.ndarray:
     """T_first_second (4, 4), file units, by the two scans as they are, which are skewed alike."""
-    odometry = Odometry(replace(frame, map_origin=None))
+    odometry = Odometry(replace(frame, map_origin=None), pair=options.pair)
     try:
         pair = [prepare_scan(scans.read(index, attributes=False).points, frame) for index in (0, 1)]
         _, second = [odometry.register(scan) for scan in pair]
@@ -208,11 +220,17 @@ def six_digits(value: float | np.floating) -> float:
 
 
 def close(
-    T_first_scan: np.ndarray, rows: list[dict[str, Any]], frame: VoxelFrame, loader: Loader
+    T_first_scan: np.ndarray,
+    rows: list[dict[str, Any]],
+    frame: VoxelFrame,
+    loader: Loader,
+    options: SequenceOptions,
 ) -> tuple[np.ndarray, tuple[tuple[int, int], ...]]:
     """The path (n, 4, 4) with its loops closed, and the frames that each of them joins."""
     sure = np.array([row["status"] == "aligned" for row in rows])
-    closed, loops = close_loops(np.stack([frame.pose_to_voxels(T) for T in T_first_scan]), sure, loader.scan)
+    closed, loops = close_loops(
+        np.stack([frame.pose_to_voxels(T) for T in T_first_scan]), sure, loader.scan, options.pair
+    )
     return np.stack([frame.pose_to_file(T_map_scan) for T_map_scan in closed]), tuple(
         (loop.earlier, loop.later) for loop in loops
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -13,12 +15,19 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 if TYPE_CHECKING:
+    from fmr_cli.feature_metric.numpy_solver import NumpySolver
     from fmr_cli.registration.prepared import Prepared
 
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
-POINTS_PER_VOXEL = 4  # of a scan that has few points, on average: finer voxels would hold no surface
+POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold noise
+# Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
+# they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
+HELD = 2.2
+NOISE = 0.06  # edges, of the scatter about planes: normals of ten points in finer voxels are mostly noise
+COARSER = 2.5  # times the edge that the count gives, at most: what still strays is curved, or clutter
+GRAIN_EVERY = 3  # points, of which one is asked about its neighbours
 NEIGHBOURS = 10  # points for a point's normal and covariance, small_gicp's own choice ...
 MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that these are mostly points of one ring
 # A neighbourhood is a line where its second principal variance is less than so much of the first: any normal across it
@@ -60,6 +69,7 @@ class PreparedScan:
         rays = self.points - sensor
         self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
         self.ranges = np.linalg.norm(rays, axis=1)
+        self._feature: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -90,13 +100,12 @@ class PreparedScan:
         centre = self.few.mean(0)
         return centre, float(np.linalg.norm(self.few - centre, axis=1).max())
 
-    @cached_property
-    def feature(self) -> np.ndarray:
-        """(d,), the global feature of the few points in their box."""
-        from fmr_cli.registration.models import fast_encoder
-
-        centre, unit = self.box
-        return fast_encoder()(((self.few - centre) / unit).astype(np.float32))
+    def feature(self, encode: NumpySolver) -> np.ndarray:
+        """(d,), the global feature of the few points in their box; worked out once, by the sequence's one encoder."""
+        if self._feature is None:
+            centre, unit = self.box
+            self._feature = encode(((self.few - centre) / unit).astype(np.float32))
+        return self._feature
 
     @cached_property
     def for_align(self) -> Prepared:
@@ -128,22 +137,57 @@ def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
     return scan if len(scan) >= MIN_POINTS else None
 
 
-def choose_voxel(points: np.ndarray, wish: float | None = None) -> float:
-    """The voxel edge that thins points (N, 3) to WORKING_POINTS, or to a quarter of them where they are few.
+def choose_voxel(points: np.ndarray, wish: float | None = None, others: Iterable[np.ndarray] = ()) -> float:
+    """The voxel edge that suits a sequence whose first scan has points (N, 3), to two digits, in their unit.
 
-    In the points' unit, to two digits. wish: an edge to be near to, within HINT. Raises RegistrationError where all
-    points are in one place.
+    others: some of the later scans, (N, 3) each; the median of what suits each of them counts. wish: an edge to be near
+    to, within HINT. Raises RegistrationError where the first scan's points are too few or all in one place.
+    """
+    edges = [suitable_voxel(points)]
+    for other in others:
+        with suppress(RegistrationError):
+            edges.append(suitable_voxel(other))
+    voxel = float(np.median(edges))
+    return float(f"{voxel:.2g}" if wish is None else np.clip(wish, voxel / HINT, voxel * HINT))
+
+
+def suitable_voxel(points: np.ndarray) -> float:
+    """The finest edge for points (N, 3) whose voxels hold a surface (HELD) rather than noise (NOISE).
+
+    It leaves WORKING_POINTS at most, and POINTS_PER_VOXEL in each on average. Raises RegistrationError.
     """
     wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
     if not spread > 0 or wanted < MIN_POINTS:
         raise RegistrationError("too few points, or all in one place")
-    voxel, centre = spread / 20, np.median(points, axis=0)
+    voxel, centred = spread / 20, points - np.median(points, axis=0)
     for _ in range(STEPS):
-        count = small_gicp.voxelgrid_sampling((points - centre) / voxel, 1.0).size()
+        count = small_gicp.voxelgrid_sampling(centred / voxel, 1.0).size()
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
-    if wish is not None:
-        return float(np.clip(wish, voxel / HINT, voxel * HINT))
-    return float(f"{voxel:.2g}")
+    largest = COARSER * voxel
+    for _ in range(STEPS):
+        apart, noise = grain(centred / voxel)
+        if voxel >= largest or (apart <= HELD and noise <= NOISE):
+            break
+        voxel = min(voxel * max(apart / HELD, noise / NOISE), largest)
+    return float(voxel)
+
+
+def grain(points: np.ndarray) -> tuple[float, float]:
+    """How far apart points (N, 3) in voxels are once thinned to one a voxel, and how noisy; in voxels.
+
+    The median distance to the tenth neighbour; and how far the flattest quarter of the neighbourhoods strays from its
+    planes (standard deviation), lines left out.
+    """
+    thinned = small_gicp.voxelgrid_sampling(points, 1.0)
+    if thinned.size() <= NEIGHBOURS:
+        return 0.0, 0.0
+    points = thinned.points()[:, :3]
+    index, squared = small_gicp.KdTree(thinned).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
+    near = points[index.astype(np.int64)]
+    arm = near - near.mean(1, keepdims=True)
+    values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", arm, arm) / NEIGHBOURS)
+    flat = np.maximum(values[values[:, 1] > LINE * values[:, 2], 0], 0)
+    return float(np.sqrt(np.median(squared[:, -1]))), float(np.sqrt(np.quantile(flat, 0.25))) if len(flat) else 0.0

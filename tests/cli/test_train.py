@@ -97,6 +97,8 @@ def test_scans_teach_all_that_registration_uses(tmp_path, fmr, samples):
         "--model", "runs/train/model.safetensors", cwd=tmp_path,
     )  # fmt: skip
     assert used.returncode == 0, used.stderr
+    used = fmr("sequence", "scans", "--out", "poses.txt", "--model", "runs/train/model.safetensors", cwd=tmp_path)
+    assert used.returncode == 0, used.stderr
     again = fmr("train", "--unsupervised", "scans", "--recipe", "runs/train/recipe.toml", "-o", "b", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     a, b = (load_file(tmp_path / run / "state.safetensors") for run in ("runs/train", "b"))

@@ -150,3 +150,16 @@ def test_directions_in_words():
     said = in_words(twists @ np.array([[1, 1, 0], [0.5, -1, 1], [0.2, 0, 3]]), 10.0)
     assert [words.split(" (")[0] for words in said] == ["shift along", "shift along", "rotation about"]
     assert said[2] == "rotation about (0.00, 0.00, 1.00)"
+
+
+def test_poses_aside_move_the_points_along_what_is_open_alone():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-5, 5, (4000, 2)), np.zeros(4000)])
+    up = np.tile([0.0, 0.0, 1.0], (4000, 1))
+    seen = observe(Matches(np.arange(4000), points, up, up, np.ones(4000), 0.01), np.ones(4000), WRONG)
+    poses = seen.aside(np.eye(4), 2.0)
+    assert len(poses) == 6  # to both sides along the two shifts and the rotation within the plane
+    for T in poses:
+        moved = points @ T[:3, :3].T + T[:3, 3] - points
+        assert np.sqrt((moved**2).sum(1).mean()) == pytest.approx(2.0, rel=0.1)
+        assert np.abs(moved[:, 2]).max() < 0.05

@@ -98,3 +98,26 @@ def test_one_scan_is_no_sequence(street):
 def test_options_that_mean_nothing_are_refused_where_they_are_made(given, says):
     with pytest.raises(FmrError, match=says):
         SequenceOptions(**given)
+
+
+def test_what_train_has_learnt_is_what_a_sequence_works_with(street, tmp_path):
+    from dataclasses import replace
+
+    from fmr_cli.io.weights import weights_bytes
+    from fmr_cli.registration.models import model
+
+    scans, own = find_scans(street[0], stop=3), tmp_path / "own.safetensors"
+    layers = [(weight, bias * 0) for weight, bias in model().weights.layers]
+    own.write_bytes(weights_bytes(replace(model().weights, layers=layers, local={})))
+    bundled, other = (align_sequence(scans, options=SequenceOptions(model=path)) for path in (None, own))
+    assert [row["status"] for row in other.rows] == ["aligned"] * 3
+    assert all(
+        a["feature_error_before"] != b["feature_error_before"]
+        for a, b in zip(bundled.rows[1:], other.rows[1:], strict=True)
+    )
+
+
+def test_a_model_that_is_not_there_is_said_before_anything_is_written(street, tmp_path):
+    with pytest.raises(FmrError, match=r"none.safetensors"):
+        align_sequence(street[0], tmp_path / "p.txt", SequenceOptions(model=tmp_path / "none.safetensors"))
+    assert not (tmp_path / "p.txt").exists()
