@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.batch.one_pair import suffix_for
 from fmr_cli.cloud import PointCloud
 from fmr_cli.geometry.frames import Frame
+from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.io import atomic_write, read_cloud, write_cloud, write_transform
 from fmr_cli.io.outputs import cell, write_json
 from fmr_cli.io.stream import collect
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Network
-from fmr_cli.multiway.pose_graph import adjoint
 from fmr_cli.registration.export import merged_clouds
 
 SCANS = ("scan", "component", "pose", "status", "links", "residual", "sigma_rot_deg", "sigma_shift", "message")

@@ -16,8 +16,8 @@ from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.observability import WEAK
 from fmr_cli.geometry.point_to_plane import point_to_plane
 from fmr_cli.geometry.sampling import sample
-from fmr_cli.geometry.se3 import exp
-from fmr_cli.multiway.pose_graph import EXACT, Prior, adjoint
+from fmr_cli.geometry.se3 import adjoint, exp
+from fmr_cli.multiway.pose_graph import EXACT, Prior
 from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 

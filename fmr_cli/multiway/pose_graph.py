@@ -16,6 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fmr_cli.errors import FmrError
 from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.se3 import adjoint
 
 EXACT = 1e-9  # sigma, edges and radians, of what is told not to move
 ROBUST = 3.0  # sigmas from which Cauchy's kernel lets a link lose weight
@@ -60,15 +61,6 @@ def check_installed(what: str) -> None:
     """Raises FmrError where GTSAM, which ``what`` needs, is not installed."""
     if importlib.util.find_spec("gtsam") is None:
         raise FmrError(f"{what} needs gtsam, which has no wheel for this platform; pip install gtsam from source")
-
-
-def adjoint(T: np.ndarray) -> np.ndarray:
-    """(6, 6): turns a twist on the right of T (4, 4) into the one on its left that does the same."""
-    A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = T[:3, :3]
-    x, y, z = T[:3, 3]
-    A[3:, :3] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T[:3, :3]
-    return A
 
 
 def bounded(information: np.ndarray, radius: float, edge: float) -> np.ndarray:

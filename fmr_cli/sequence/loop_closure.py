@@ -15,8 +15,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.multiway import looks
-from fmr_cli.multiway.pose_graph import adjoint, bounded, prior_factor, symmetric
+from fmr_cli.multiway.pose_graph import bounded, prior_factor, symmetric
 from fmr_cli.registration.models import local_encoder
 from fmr_cli.registration.options import Options
 from fmr_cli.sequence.local_map import COARSE, FINE, LocalMap, displacement

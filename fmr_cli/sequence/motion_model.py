@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.geometry.point_to_plane import step_motion
-from fmr_cli.geometry.se3 import exp, log
+from fmr_cli.geometry.se3 import adjoint, exp, log
 from fmr_cli.sequence.local_map import WIDE, orthonormal
 from fmr_cli.sequence.observability import Observability
 
@@ -199,15 +199,6 @@ def moved_by(shift: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, 3] = shift
     return T
-
-
-def adjoint(T_a_b: np.ndarray) -> np.ndarray:
-    """(6, 6): a twist in the axes of b as one in the axes of a."""
-    R = T_a_b[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = R
-    out[3:, :3] = np.cross(T_a_b[:3, 3], R, axis=0)
-    return out
 
 
 def about_centre(T_map_scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
