@@ -11,8 +11,9 @@ import numpy as np
 
 from fmr_cli.errors import FmrError, ModelError
 from fmr_cli.geometry.frames import enter_frames, leave_frames
+from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.io.files import reason
-from fmr_cli.multiway import consistency, pose_graph
+from fmr_cli.multiway import consistency
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.links import Hypothesis, Link, best_of, key_of
 from fmr_cli.multiway.looks import best_of as best_look
@@ -208,7 +209,7 @@ def flipped(link: Link) -> Link:
     if link.source > link.target:
         return link
     hypotheses = [replace(h, T_target_source=np.linalg.inv(h.T_target_source)) for h in link.hypotheses]
-    A = pose_graph.adjoint(link.T_target_source)
+    A = adjoint(link.T_target_source)
     return replace(
         link, source=link.target, target=link.source, hypotheses=hypotheses, information=A.T @ link.information @ A
     )

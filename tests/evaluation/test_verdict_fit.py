@@ -7,7 +7,8 @@ import pytest
 
 from fmr_cli.evaluation.verdict_evidence import Judged, pair_evidence
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
-from fmr_cli.report.calibration import calibration_table, plot_calibration
+from fmr_cli.registration.confidence import DETAIL, STRETCH
+from fmr_cli.report.calibration import calibration_error, calibration_table, plot_calibration
 from fmr_cli.synthetic.calibration_pairs import DRAWN
 
 
@@ -17,8 +18,9 @@ def drawn() -> list[Judged]:
     rng = np.random.default_rng(0)
     looks = []
     for number in range(1500):
-        x = np.column_stack([np.ones(3), rng.normal(size=(3, 8))])
+        x = np.column_stack([np.ones(3), rng.normal(size=(3, 9))])
         x[0, 2:5] += 4
+        x[:, [STRETCH, DETAIL]] = np.abs(x[:, [STRETCH, DETAIL]])  # nothing that bounds a confidence by itself
         right = np.zeros(3, bool)
         right[0] = rng.random() < 1 / (1 + np.exp(-2 * x[0, 1]))
         looks.append(Judged(x, right, "drawn", True, number))
@@ -34,7 +36,7 @@ def test_confidence_is_the_share_that_is_right(drawn):
 
 
 def test_no_kind_counts_against_its_own_sense(drawn):
-    against = [Judged(j.x * [1, -1, *[1] * 7], j.right, j.kind, j.unique, j.number) for j in drawn]
+    against = [Judged(j.x * [1, -1, *[1] * 8], j.right, j.kind, j.unique, j.number) for j in drawn]
     assert fit(against).support[1] == 0
 
 
@@ -43,6 +45,7 @@ def test_the_table_counts_every_pair_and_its_right_ones():
     lines = calibration_table(confidence, right).splitlines()
     assert [int(line.split()[-2]) for line in lines[1:-1]] == [1, 0, 0, 0, 1, 1, 1]
     assert lines[-1] == "aligned: precision 0.6667, recall of right poses 0.6667"
+    assert calibration_error(confidence, right) == pytest.approx((0.95 + 0.8 + 0.05 + 0) / 4)
 
 
 def test_the_plot_is_a_png(tmp_path, drawn):

@@ -10,7 +10,6 @@ from fmr_cli.geometry.motion import Motion, exp
 from fmr_cli.multiway.pose_graph import (
     Factor,
     Prior,
-    adjoint,
     bounded,
     covariance_of,
     in_order,
@@ -34,11 +33,6 @@ def world(count: int, seed: int = 0) -> list[np.ndarray]:
 def factor(poses, i, j, twist=(0,) * 6) -> Factor:
     T = exp(np.array(twist, float)) @ np.linalg.inv(poses[j]) @ poses[i]
     return Factor(i, j, T, np.diag(1 / SIGMA**2))
-
-
-def test_the_adjoint_takes_a_twist_from_the_right_to_the_left():
-    T, xi = world(1)[0], np.array([0.1, -0.2, 0.05, 0.3, 0.2, -0.1])
-    assert np.allclose(T @ exp(xi), exp(adjoint(T) @ xi) @ T)
 
 
 def test_it_finds_exact_poses_from_rough_ones():

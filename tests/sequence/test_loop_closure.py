@@ -15,6 +15,7 @@ pytest.importorskip("gtsam")
 VOXEL = 0.4
 
 
+@pytest.mark.slow
 def test_a_drifted_round_is_closed():
     place, poses, rng = make_street(60), drive(60)[::10], np.random.default_rng(3)
     truth = np.linalg.inv(poses[0]) @ poses
