@@ -26,6 +26,7 @@ from fmr_cli.registration.verdict_weights import Weights
 
 ALIGNED = 0.7  # confidence from which a pose is called aligned
 MOST_STRETCH = 0.05  # a stretch beyond it is as bad
+AS_GOOD = 1.5  # times as close as a surface's own neighbours: beyond, points are the same, and no surer for it
 # What no other evidence outweighs, and the confidence that it leaves at most; by the looks at 640 made-up pairs, bent
 # ones too (`python -m benchmarks.calibrate` counts them). Such pairs are too few for the weights to say so themselves.
 OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: none of 892 right poses had that
@@ -63,8 +64,8 @@ class Evidence(Agreement):
 
     def quality(self) -> np.ndarray:
         """How well the surfaces fit where they meet, more is better: (3,)."""
-        ratios = [1 / self.offset, 1 / self.turn, (self.explained + 10) / (self.contradicted + 10)]
-        return np.log(np.clip(ratios, 1e-3, 1e3))
+        close, along = min(1 / self.offset, AS_GOOD), min(1 / self.turn, AS_GOOD)
+        return np.log(np.clip([close, along, (self.explained + 10) / (self.contradicted + 10)], 1e-3, 1e3))
 
     def vector(self) -> np.ndarray:
         """What the logistic model sees, after a 1 for the intercept: of each kind of evidence, more is better."""

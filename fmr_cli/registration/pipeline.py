@@ -143,7 +143,7 @@ def look(source: Prepared, target: Prepared, options: Options, threads: int, tim
 def in_places(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge | None:
     """What is found in the parts of a map where a glance finds most; None where it has no such parts.
 
-    The best pose is right if it is right in its part, and none of those found elsewhere is.
+    The poses of different places exclude each other: the best one shares its confidence with what else looks right.
     """
     glances: list[tuple[Pair, list[Hypothesis]]] = []
     for part in places.parts(source, target, options):
@@ -175,8 +175,9 @@ def in_places(source: Prepared, target: Prepared, options: Options, threads: int
         for j in others
     ]
     elsewhere = [c for c in elsewhere if not pair.same(c.T_target_source, best.T_target_source)]
-    alone = float(np.prod([1 - c.confidence for c in elsewhere]))
-    judge.candidates = [replace(best, confidence=best.confidence * alone), *elsewhere, *judge.candidates[1:]]
+    # At most one of them is right, or none: each weighs its odds against "none", as if it were alone.
+    odds = [c.confidence / max(1 - c.confidence, 1e-12) for c in (best, *elsewhere)]
+    judge.candidates = [replace(best, confidence=odds[0] / (1 + sum(odds))), *elsewhere, *judge.candidates[1:]]
     return judge
 
 
