@@ -17,15 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
+from fmr_cli.evaluation.verdict import calibration_error
 from fmr_cli.evaluation.verdict_evidence import Judged, gather
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit
 from fmr_cli.registration.confidence import BARE, CONTRADICTION, DETAIL, OTHER_SCALE, STRETCH, detail_log, standing
-from fmr_cli.report.calibration import calibration_error, calibration_table, plot_calibration
+from fmr_cli.registration.verdict_weights import Weights
+from fmr_cli.report.calibration import calibration_table, plot_calibration
 
 
-def bounds_in(evidence: Sequence[Judged]) -> list[str]:
+def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     """How often right poses have what bounds the confidence whatever the weights say, see ``confidence.most``."""
-    weights = fit(evidence)
     first = [int(standing(j.x, weights)[0].argmax()) for j in evidence]
     x, right = zip(*((j.x[i], j.right[i]) for j, i in zip(evidence, first, strict=True)), strict=True)
     seen, good = np.array(x), np.array(right)
@@ -53,11 +54,12 @@ def main() -> None:
     print(f"{len(evidence)} looks at {args.pairs} pairs, each judged by weights fitted on others:")
     print(calibration_table(confidence, right))
     print(f"expected calibration error {calibration_error(confidence, right):.3f}")
-    for line in bounds_in(evidence):
+    weights = fit(evidence)
+    for line in bounds_in(evidence, weights):
         print(line)
     made = {"made by": f"python -m benchmarks.calibrate --pairs {args.pairs} --seed {args.seed}"}
-    weights = {name: [float(f"{v:.6g}") for v in values] for name, values in asdict(fit(evidence)).items()}
-    (args.out / "verdict.json").write_text(json.dumps(made | weights, indent=1) + "\n")
+    rounded = {name: [float(f"{v:.6g}") for v in values] for name, values in asdict(weights).items()}
+    (args.out / "verdict.json").write_text(json.dumps(made | rounded, indent=1) + "\n")
     try:
         plot_calibration(args.out / "calibration.png", confidence, right)
     except ImportError as error:

@@ -130,6 +130,17 @@ def judge_many(
         yield from pool.map(run, cases)
 
 
+def calibration_error(confidence: np.ndarray, right: np.ndarray) -> float:
+    """The expected calibration error: |confidence - share right| in BINS equal bins, by their looks; both (n,)."""
+    number = bins_of(confidence)
+    return float(sum(np.abs((confidence - right)[number == b].sum()) for b in range(BINS)) / len(confidence))
+
+
+def bins_of(confidence: np.ndarray) -> np.ndarray:
+    """Which of BINS equal bins each confidence (n,) lies in; 1 in the last."""
+    return np.minimum((confidence * BINS).astype(int), BINS - 1)
+
+
 def reliability(rows: Sequence[Judged]) -> tuple[list[dict[str, float]], float]:
     """The reliability curve in BINS equal bins of confidence, and the expected calibration error.
 
@@ -137,15 +148,13 @@ def reliability(rows: Sequence[Judged]) -> tuple[list[dict[str, float]], float]:
     deserves it.
     """
     confidence, sound = np.array([r.confidence for r in rows]), np.array([r.sound for r in rows], float)
-    number = np.minimum((confidence * BINS).astype(int), BINS - 1)
-    curve, error = [], 0.0
+    number, curve = bins_of(confidence), []
     for b in range(BINS):
         here = number == b
         if here.any():
             mean, share = float(confidence[here].mean()), float(sound[here].mean())
             curve.append({"low": b / BINS, "pairs": int(here.sum()), "confidence": mean, "right": share})
-            error += here.mean() * abs(mean - share)
-    return curve, float(error)
+    return curve, calibration_error(confidence, sound)
 
 
 def summary(rows: Iterable[Judged]) -> dict[str, object]:

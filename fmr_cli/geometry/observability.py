@@ -18,6 +18,8 @@ REACH = 1.5  # voxel edges: correspondences further apart are no observations
 BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated, those of two blocks not
 BENDS = 8.0  # independent parts of a scan that is bent or drifted as a whole: half an extent each
 NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
+# Counted as left of a direction without a block: without the one block that alone holds it, nothing would be.
+LEFT = 1e-3
 LEAST_BLOCKS = 8  # fewer say nothing about the scatter of their sums
 
 
@@ -86,7 +88,7 @@ def sandwich(J: np.ndarray, pull: np.ndarray, slope: np.ndarray, block: np.ndarr
     g_b = np.stack([np.bincount(block, row, count) for row in J * pull], 1)
     inverse = pseudo_inverse(D_b.sum(0))
     step = inverse @ g_b.sum(0)
-    g_b = np.linalg.solve(np.eye(6) - D_b @ inverse, (g_b - D_b @ step)[..., None])[..., 0]
+    g_b = np.linalg.solve((1 + LEFT) * np.eye(6) - D_b @ inverse, (g_b - D_b @ step)[..., None])[..., 0]
     found = inverse @ (g_b.T @ g_b) @ inverse * (count - 1) / count
     return found * max(float(step @ pseudo_inverse(found) @ step) / 6, 1.0)
 

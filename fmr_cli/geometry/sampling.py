@@ -9,6 +9,7 @@ from fmr_cli.geometry.voxels import occupied_voxels
 
 WORKING_VOXELS = 5000  # the voxel edge is chosen so that about so many are occupied
 SAMPLE = 15_000  # points that the choice of the voxel edge looks at
+WITHIN = 0.98  # share of a cloud's points within its reach
 SPACING_SAMPLE = 1_000  # of them, whose nearest neighbour is looked up
 SCALE_ROUNDS, SCALE_TOLERANCE = 20, 0.02  # rounds at most; share of the wanted voxels that may be too many
 OBLIQUE = 0.5377, 0.3183, 0.7809  # a line that no usual grid is square to
@@ -45,6 +46,12 @@ def thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndar
 def sample(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """At most ``count`` points without repetition, (N, 3) -> (min(N, count), 3)."""
     return points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]
+
+
+def reach(points: np.ndarray, rng: np.random.Generator) -> float:
+    """How far most of the points (N, 3) lie from their middle, own unit."""
+    some = thinned(points, SAMPLE, rng)
+    return float(np.quantile(np.linalg.norm(some - np.median(some, axis=0), axis=1), WITHIN))
 
 
 def working_scale(points: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:

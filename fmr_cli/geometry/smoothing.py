@@ -18,6 +18,12 @@ def local_planes(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[np
     of the neighbours from it, over the distance of the farthest. That is noise over the neighbourhood's size, where
     there is noise, and small on any smooth surface.
     """
+    moved, normals, deviation, radius = planes_through(points, tree, neighbours)
+    return moved, normals, deviation / radius
+
+
+def planes_through(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[np.ndarray, ...]:
+    """``local_planes``, with the deviation (N,) and the distance of the farthest neighbour (N,) apart, own unit."""
     distance, index = tree.query(points, min(neighbours, tree.n))
     around = tree.data[index]
     middle = around.mean(1)
@@ -26,7 +32,7 @@ def local_planes(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[np
     normals, least = smallest_eigenvector(*products)
     deviation = np.sqrt(np.maximum(least, 0) / max(index.shape[1] - 3, 1))
     off = np.einsum("ij,ij->i", points - middle, normals)
-    return points - off[:, None] * normals, normals, deviation / np.maximum(distance[:, -1], 1e-300)
+    return points - off[:, None] * normals, normals, deviation, np.maximum(distance[:, -1], 1e-300)
 
 
 def roughness(points: np.ndarray, wide: int) -> tuple[float, float]:
@@ -39,9 +45,9 @@ def roughness(points: np.ndarray, wide: int) -> tuple[float, float]:
     """
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     some = points[:: max(len(points) // PROBES, 1)]
-    near = local_planes(some, tree, NEAR)[2]
+    near, radius = planes_through(some, tree, NEAR)[2:]
+    rough = float(np.median(near / radius))
     if wide >= tree.n:
-        return float(np.median(near)), np.inf
-    far = local_planes(some, tree, wide)[2]
-    radii = [tree.query(some, [count])[0][:, 0] for count in (NEAR, wide)]
-    return float(np.median(near)), float(np.median(far * radii[1] / np.maximum(near * radii[0], 1e-300)))
+        return rough, np.inf
+    far = planes_through(some, tree, wide)[2]
+    return rough, float(np.median(far / np.maximum(near, 1e-300)))

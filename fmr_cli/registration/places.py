@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from fmr_cli.geometry.sampling import thinned
+from fmr_cli.geometry.sampling import WITHIN
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.prepared import MIN_POINTS, Prepared
 
@@ -19,19 +19,12 @@ FROM = 2.5  # times the source's reach, from which the target is taken for a map
 WIDTH, STEP = 3.0, 1.5  # of a part, and from one to the next, in reaches: some part holds nearly all that a scan saw
 MOST_PARTS = 400  # a reach that gives more is hardly that of a scan in a map: a tea cup and a street
 FEWEST = 20 * MIN_POINTS  # points of a part that is worth a look
-WITHIN, LOOKED_AT = 0.98, 20_000  # share of a cloud's points within its reach, and how many of them are asked
-
-
-def reach(cloud: Prepared) -> float:
-    """How far most of the points lie from their middle, own unit."""
-    some = thinned(cloud.points, LOOKED_AT, np.random.default_rng(cloud.seed))
-    return float(np.quantile(np.linalg.norm(some - np.median(some, axis=0), axis=1), WITHIN))
 
 
 def is_map(source: Prepared, target: Prepared, options: Options) -> bool:
     """Whether the place of the source in the target is to be sought part by part."""
     asked = isinstance(options.init, str) and options.init in ("auto", "features")
-    return asked and not options.scale and options.voxel_size is None and reach(target) > FROM * reach(source)
+    return asked and not options.scale and options.voxel_size is None and target.reach > FROM * source.reach
 
 
 def parts(source: Prepared, target: Prepared, options: Options) -> Iterator[Prepared]:
@@ -39,7 +32,7 @@ def parts(source: Prepared, target: Prepared, options: Options) -> Iterator[Prep
 
     With ``options.max_shift``, those alone that it allows.
     """
-    size = reach(source)
+    size = source.reach
     low, high = np.quantile(target.points, [1 - WITHIN, WITHIN], axis=0)
     steps = [max(math.ceil((b - a) / (STEP * size)), 1) for a, b in zip(low, high, strict=True)]
     if math.prod(steps) > MOST_PARTS:

@@ -12,7 +12,7 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.gicp import GicpCloud
 from fmr_cli.geometry.planar import plane_of, raised
-from fmr_cli.geometry.sampling import distinct, sample, thinned, working_scale
+from fmr_cli.geometry.sampling import distinct, reach, sample, thinned, working_scale
 from fmr_cli.geometry.smoothing import roughness
 from fmr_cli.geometry.strays import Strays, strays
 from fmr_cli.geometry.surface import Surface
@@ -31,8 +31,9 @@ class Prepared:
     """A cloud made ready for registration; what is computed from it is kept, within bounds, for its next pair.
 
     points: (N, 3) float64, centred, at most AT_MOST, finite and distinct. frame: the centred coordinates, whose origin
-    is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; file's unit. notes:
-    what a person should know of it, as how many points are no surface (see ``strays``). Raises
+    is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; reach: of most of them
+    from their middle; file's unit. notes: what a person should know of it, as how many points are no surface (see
+    ``strays``). Raises
     RegistrationError: fewer than 10 distinct points, all in one place.
     """
 
@@ -66,6 +67,7 @@ class Prepared:
         """Points (N, 3), centred, and their scales; nothing is known of them yet."""
         self.points = points
         self.edge, self.spacing = working_scale(points, rng)
+        self.reach = reach(points, np.random.default_rng(self.seed))
         self._surfaces, self._described, self._fine, self._gicp, self._roughness = (Memo(KEPT) for _ in range(5))
 
     @property

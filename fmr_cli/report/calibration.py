@@ -27,13 +27,6 @@ def calibration_table(confidence: np.ndarray, right: np.ndarray) -> str:
     return "\n".join(lines)
 
 
-def calibration_error(confidence: np.ndarray, right: np.ndarray) -> float:
-    """The expected calibration error: |confidence - share right| over ten equal bins, by the looks in each."""
-    number = np.minimum((confidence * 10).astype(int), 9)
-    off = [np.abs((confidence - right)[number == b].sum()) for b in range(10)]
-    return float(np.sum(off) / len(confidence))
-
-
 def plot_calibration(path: Path, confidence: np.ndarray, right: np.ndarray) -> None:
     """Confidence against the share that is right, in tenths of the pairs; an image file by the path's suffix."""
     edges = np.quantile(confidence, np.linspace(0, 1, 11))

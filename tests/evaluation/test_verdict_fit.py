@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fmr_cli.evaluation.verdict import calibration_error
 from fmr_cli.evaluation.verdict_evidence import Judged, pair_evidence
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
 from fmr_cli.registration.confidence import DETAIL, STRETCH
-from fmr_cli.report.calibration import calibration_error, calibration_table, plot_calibration
+from fmr_cli.report.calibration import calibration_table, plot_calibration
 from fmr_cli.synthetic.calibration_pairs import DRAWN
 
 

@@ -105,3 +105,13 @@ def test_a_turn_is_seen_about_the_scan_however_far_the_map_s_centre_is(room_scan
     far = observability.certainty(source, target, np.eye(4), away).information
     assert observability.undetermined(far, 2.0)
     np.testing.assert_allclose(observability.about(far, -away), near, rtol=1e-6, atol=1e-6 * np.abs(near).max())
+
+
+def test_a_direction_that_one_block_alone_holds_is_no_division_by_nothing() -> None:
+    """Eight blocks of six observations, one a direction; only the first block has one of the last direction."""
+    J, block = np.tile(np.eye(6), 8), np.repeat(np.arange(8), 6)
+    J[5, block > 0] = 0.0
+    pull = np.random.default_rng(0).normal(size=48)
+    found = observability.sandwich(J, pull, np.ones(48), block)
+    assert np.isfinite(found).all()
+    assert 0.3 < np.sqrt(found[0, 0] * 8) < 3  # of unit noise, seen eight times
