@@ -14,6 +14,7 @@ from fmr_cli.batch.manifest import Pair, read_manifest
 from fmr_cli.batch.one_pair import Block, Done, PairRunner, failed
 from fmr_cli.batch.results import ResultsTable
 from fmr_cli.io import write_transform
+from fmr_cli.io.files import remove_leftovers
 from fmr_cli.io.outputs import write_json
 from fmr_cli.registration import Options
 from fmr_cli.registration.result import plain
@@ -47,7 +48,8 @@ def align_batch(
     with ResultsTable(out, settings) as table:
         rows: list[dict[str, Any]] = [*table.open(pairs, resume)]
         todo = pairs[len(rows) :]
-        for folder in ("transforms", "metrics", *(["aligned"] if aligned else []), *(["merged"] if merged else [])):
+        folders = ("transforms", "metrics", *(["aligned"] if aligned else []), *(["merged"] if merged else []))
+        for folder in folders:
             (out / folder).mkdir(exist_ok=True)
         team = on_this_machine(workers, len(todo))
         points = REMOTE_POINTS if team.remote else CACHED_POINTS // team.count
@@ -62,6 +64,8 @@ def align_batch(
                 rows.append(done.row)
                 if on_row:
                     on_row(done.row, len(rows), len(pairs))
+        for folder in folders:  # of workers that were killed, of pairs that others have written since
+            remove_leftovers(out / folder)
     return rows
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fmr_cli.errors import CloudFileError
 
-LEFTOVER = re.compile(r"(?P<host>\w+)-(?P<pid>[0-9]{1,9})-[0-9a-f]{8}\.tmp")  # of a temporary's name, its middle
+TEMPORARY = re.compile(r"\..*\.(?P<host>\w+)-(?P<pid>[0-9]{1,9})-[0-9a-f]{8}\.tmp(\..*)?")  # a temporary's name
 DAY = 86_400  # seconds
 
 
@@ -58,7 +58,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         return
     check_writable(path)
     final = path.resolve()  # a symbolic link stays one
-    remove_leftovers(final)
+    remove_leftovers(final.parent, prefix_of(final))
     temporary = final.with_name(f"{prefix_of(final)}{host()}-{os.getpid()}-{secrets.token_hex(4)}.tmp{final.suffix}")
     try:
         yield temporary
@@ -79,15 +79,16 @@ def host() -> str:
     return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:30]
 
 
-def remove_leftovers(final: Path) -> None:
-    """Removes what processes that are no more have left of writing this file: of this machine's, or a day old."""
-    prefix = prefix_of(final)
-    for path in final.parent.iterdir():
-        if not path.name.startswith(prefix):
-            continue
-        found = LEFTOVER.fullmatch(path.name.removeprefix(prefix).removesuffix(final.suffix))
+def remove_leftovers(folder: Path, prefix: str = ".") -> None:
+    """Removes what processes that are no more have left of writing files there: of this machine's, or a day old.
+
+    prefix: how the names begin, for those of one file (``prefix_of``).
+    """
+    for name in os.listdir(folder):  # names alone: a folder may hold the results of ten thousand pairs
+        found = TEMPORARY.fullmatch(name) if name.startswith(prefix) else None
         if found is None:
             continue
+        path = folder / name
         with suppress(OSError):
             here = found["host"] == host() and os.name == "posix"
             dead = here and not is_running(int(found["pid"]))
@@ -96,14 +97,17 @@ def remove_leftovers(final: Path) -> None:
 
 
 def is_running(pid: int) -> bool:
-    """Whether there is a process of that number (POSIX)."""
+    """Whether there is a process of that number (POSIX), and not only its exit status, which nobody has asked for."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:  # another user's
         pass
-    return True
+    try:  # Linux: "pid (name) state ...", where the name may hold anything
+        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0] not in "ZX"
+    except (OSError, IndexError):
+        return True
 
 
 def reason(error: BaseException) -> str:

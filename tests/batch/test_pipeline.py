@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from fmr_cli import Options, align, read_cloud
 from fmr_cli.batch import align_batch, cache, one_pair, pipeline
 from fmr_cli.batch.manifest import Pair
 from fmr_cli.errors import CloudFileError
+from fmr_cli.io.files import host
 from fmr_cli.registration import export
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -57,8 +59,13 @@ def test_cut_off_and_gone_on_with_it_keeps_the_rows_it_has(manifest, tmp_path):
     assert len(before) == 2
     with pytest.raises(CloudFileError, match="is there already"):
         align_batch(manifest, tmp_path / "out")
+    with subprocess.Popen(["true"]) as killed:
+        killed.wait()
+    half = tmp_path / "out" / "transforms" / f".scan_b_scan_a.{host()}-{killed.pid}-01234567.tmp.txt"
+    half.write_text("1 0")
     told = []
     rows = align_batch(manifest, tmp_path / "out", resume=True, on_row=lambda row, done, total: told.append(done))
+    assert not half.exists()
     assert told == [3, 4]
     assert rows[:2] == before
     assert rows == table(tmp_path / "out")
