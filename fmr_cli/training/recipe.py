@@ -160,6 +160,7 @@ class ScanRecipe:
     made_up: int = 96  # pairs of procedural scans, so that nothing is forgotten
     patches: int = 96  # of one place, of each scan of a pair, at most
     others: int = 48  # of each scan's patches that are in it alone
+    patch_points: int = 32  # of a patch's 64, drawn anew in each step: two fifths of the time, and another sampling
     batch: int = 2  # pairs of a step
     temperature: float = 0.07  # of InfoNCE
     apart: float = 3.0  # voxel edges: nearer places are not each other's negatives
@@ -174,8 +175,9 @@ class ScanRecipe:
     whole: Recipe = field(default_factory=lambda: Recipe(crops=1024, decoder_warmup=100, held_out_pairs=12))
 
     def __post_init__(self) -> None:
+        counts = "rounds", "scans", "patches", "patch_points", "batch", "steps", "epoch_steps", "tested"
         for name, value in vars(self).items():
-            least = 1 if name in ("rounds", "scans", "patches", "batch", "steps", "epoch_steps", "tested") else 0
+            least = 1 if name in counts else 0
             if isinstance(value, int | float) and not value >= least:
                 raise RecipeError(f"the recipe has {name} = {value}; give a larger number")
         if not 0 < self.held_out < 1 or not self.temperature > 0:
