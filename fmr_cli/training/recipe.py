@@ -164,7 +164,8 @@ class ScanRecipe:
     batch: int = 2  # pairs of a step
     temperature: float = 0.07  # of InfoNCE
     apart: float = 3.0  # voxel edges: nearer places are not each other's negatives
-    learning_rate: float = 5e-4  # twice as much gains a little more on the scans and forgets three times as much
+    learning_rate: float = 2e-3  # a minute has some hundred steps
+    stays: float = 0.4  # share of the start's weights in the mean that is kept, so that little is forgotten
     whole_every: int = 5  # one step in so many is the global encoder's; 0 leaves it as it is
     steps: int = 1200
     epoch_steps: int = 100
@@ -180,8 +181,8 @@ class ScanRecipe:
             least = 1 if name in counts else 0
             if isinstance(value, int | float) and not value >= least:
                 raise RecipeError(f"the recipe has {name} = {value}; give a larger number")
-        if not 0 < self.held_out < 1 or not self.temperature > 0:
-            raise RecipeError("the recipe needs held_out between 0 and 1, and a temperature above 0")
+        if not 0 < self.held_out < 1 or not self.temperature > 0 or not self.stays < 1:
+            raise RecipeError("the recipe needs held_out between 0 and 1, stays below 1, and a temperature above 0")
         if self.scans < 2:
             raise RecipeError("the recipe has scans = 1; give two or more")
         if not self.pairs + self.single + self.made_up:
