@@ -200,13 +200,12 @@ class ScanRecipe:
         return replace(
             self,
             rounds=1 if minutes < 3 else 2 if minutes < 8 else 3,
-            scans=16 if minutes < 3 else 40,
+            scans=_between(10 * minutes**0.5, 10, 40),  # a round then takes a fifth of the time or so on two cores
             pairs=_between(40 * minutes, 40, 240),
             single=_between(12 * minutes, 12, 64),
-            made_up=_between(16 * minutes, 16, 96),
+            made_up=_between(20 * minutes, 20, 96),
             tested=8 if minutes < 3 else 12,
             checked=_between(12 * minutes, 12, 60),
-            epoch_steps=50 if minutes < 3 else 100,
             whole_every=0 if minutes < 3 else self.whole_every,
         )
 
