@@ -18,7 +18,7 @@ from threadpoolctl import ThreadpoolController
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, mirror, places, refinement
-from fmr_cli.registration.confidence import LIKELY, Judge
+from fmr_cli.registration.confidence import LIKELY, Candidate, Judge
 from fmr_cli.registration.looks import FIRST, FURTHER, SURE, at_once, consider, features
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -52,23 +52,30 @@ def align(
     already. The answer is the same bit for bit, whatever their number and the machine's. check: also let the paper's IC
     solver go on from the pose found, see ``Registration.feature_check``. hints: where the pair is not ``aligned``, also
     take a quick look whether the source's mirror image fits, and warn; False where many pairs are tried that need not
-    fit. Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or the device,
-    FmrError for options that contradict each other.
+    fit. Where the scans contradict a pose somewhat, that look is part of the verdict: the better fit is believed.
+    Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or the device, FmrError
+    for options that contradict each other.
     """
     found = as_they_are(source, target, options, threads, check)
+    if found.status == "aligned" and mirror.unlikely(found):
+        return found
+    image = None
+    if found.status == "aligned" or (hints and not options.allow_mirror):
+        image = mirror_look(source, target, options)
+    if image and found.status == "aligned":
+        found = mirror.weighed(found, image)
     if found.status == "aligned":
         return found
     if not options.allow_mirror:
-        fits = mirror_fits(source, target, options) if hints else None
-        found.warnings += [] if fits is None else [mirror.HINT.format(fits)]
+        found.warnings += [mirror.HINT.format(image.confidence)] if image and hints else []
         return found
-    image = mirror.image(source, options.seed)
-    other = as_they_are(image, target, options, threads, check)
-    return mirror.undone(other, image.centre) if other.status == "aligned" else found
+    mirrored = mirror.image(source, options.seed)
+    other = as_they_are(mirrored, target, options, threads, check)
+    return mirror.undone(other, mirrored.centre) if other.status == "aligned" else found
 
 
-def mirror_fits(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options) -> float | None:
-    """The confidence that the mirror image of the source fits the target, where a quick look is sure of it."""
+def mirror_look(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options) -> Candidate | None:
+    """How the mirror image of the source fits the target, where a quick look is sure that it does."""
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):
         image = mirror.image(source, options.seed)
@@ -77,7 +84,7 @@ def mirror_fits(source: PointCloud | Prepared, target: PointCloud | Prepared, op
             judge = Judge(make_pair(image, target, options, 2, *detail))
             consider(judge, features(judge.pair, time), time)
             if judge.sure(SURE):
-                return judge.best.confidence
+                return judge.best
     return None
 
 
