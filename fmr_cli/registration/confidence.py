@@ -201,8 +201,9 @@ class Judge:
         self.weigh(self.candidates)
 
     def knows(self, T_target_source: np.ndarray) -> bool:
-        """Whether a candidate has that pose already."""
-        return any(self.pair.same(T_target_source, c.T_target_source) for c in self.candidates)
+        """Whether a candidate has that pose and fits as well there: what a refinement has spoilt may be tried again."""
+        near = [c.T_target_source for c in self.candidates if self.pair.same(T_target_source, c.T_target_source)]
+        return bool(near) and max(map(self.pair.overlap_score, near)) >= self.pair.overlap_score(T_target_source)
 
     def last_word(self, T_target_source: np.ndarray) -> str:
         """What is known of a pose, for the log."""
