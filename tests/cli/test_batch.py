@@ -40,7 +40,9 @@ def folder(tmp_path, samples):
 def run(tmp_path_factory, samples, fmr_process):
     """A run of two workers that several tests look at: its folder, the process."""
     folder = scans(tmp_path_factory.mktemp("run"), samples)
-    return folder, fmr_process("batch", "pairs.csv", "--out", "out", "--aligned", "--merged", "--workers", 2, cwd=folder)
+    return folder, fmr_process(
+        "batch", "pairs.csv", "--out", "out", "--aligned", "--merged", "--workers", 2, cwd=folder
+    )
 
 
 def rows(folder, out="out"):
