@@ -33,6 +33,7 @@ MAP_KEYFRAMES = 20
 # than a counterpart costs at the end of the reach that still fits.
 OUTLIER_COST = 4.0
 EVERY = 100  # points of a scan, of which one says how far it has moved since a keyframe
+TILTED = 0.5
 NO_LRU = 1 << 30  # insertions after which small_gicp would forget a voxel: never
 
 
@@ -144,7 +145,10 @@ class LocalMap:
 
     def _seen(self, scan: PreparedScan, T_map_scan: np.ndarray, matches: Matches) -> Observability:
         wrong = WRONG_STANDING if self.moved(scan, T_map_scan) < STANDING else WRONG
-        return clearly_observed(matches, wrong) or observe(matches, scan.trust[matches.index], wrong)
+        clear = clearly_observed(matches, wrong)
+        if clear:
+            return clear
+        return observe(matches, scan.trust[matches.index], np.minimum(wrong, TILTED * scan.tilt[matches.index]))
 
     def moved(self, scan: PreparedScan, T_map_scan: np.ndarray) -> float:
         """Voxels, on average, from where the nearest of the keyframes stood."""

@@ -147,12 +147,13 @@ def clearly_observed(matches: Matches, wrong: float) -> Observability | None:
     return jacobians.observability(H, cross, matches.rms).as_observed()
 
 
-def observe(matches: Matches, trust: np.ndarray, wrong: float) -> Observability:
-    """The same, however weak; trust: (N,), 0 to 1, in their normals."""
+def observe(matches: Matches, trust: np.ndarray, wrong: np.ndarray) -> Observability:
+    """The same, however weak; trust: (N,), 0 to 1, in their normals; wrong: (N,), rad, what these are wrong by."""
     jacobians = Jacobians.of(matches, matches.weight * trust)
     H, cross = jacobians.information()
     arm = (matches.moved - jacobians.centre) / jacobians.radius
-    return jacobians.observability(H + wrong**2 * across(arm, jacobians), cross, matches.rms)
+    pretended = across(arm, replace(jacobians, weight=jacobians.weight * wrong**2))
+    return jacobians.observability(H + pretended, cross, matches.rms)
 
 
 def across(arm: np.ndarray, jacobians: Jacobians) -> np.ndarray:

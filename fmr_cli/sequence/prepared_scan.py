@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
-POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold noise
+POINTS_PER_VOXEL = 1.4  # of a scan that has few points, on average: finer voxels would hold single points
 # Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
 # they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
 HELD = 2.2
@@ -34,7 +34,8 @@ MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that th
 # would do, and the one that noise picks is the scanner's pattern, which holds the scan where the map's keyframe stood.
 LINE = 0.1
 SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from which more neighbours are asked
-TILT = 3.0  # times the scan's median error, at which a normal is half trusted
+TILT = 3.0  # times the scan's median error, at which a normal is half trusted ...
+CLEAN = 0.05  # ... which counts as at least so much, rad: beside flawless walls an edge is no worse than elsewhere
 FEW = 512  # points that a scan's global feature is made of: enough to tell poses apart, 2 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
 # Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
@@ -62,17 +63,41 @@ class PreparedScan:
         self.points = self.cloud.points()[:, :3]
         self.normals = self.cloud.normals()[:, :3]
         self.solid = ~lines(self.points, tree, NEIGHBOURS)
-        if self.solid.mean() < 1 - SPARSE and len(self.points) > MANY_NEIGHBOURS:
-            small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
-            self.normals = np.where(self.solid[:, None], self.normals, self.cloud.normals()[:, :3])
-            self.solid[~self.solid] = ~lines(self.points, tree, MANY_NEIGHBOURS, np.flatnonzero(~self.solid))
+        if len(self.points) > MANY_NEIGHBOURS:
+            self._look_wider(tree)
         rays = self.points - sensor
         self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
         self.ranges = np.linalg.norm(rays, axis=1)
         self._feature: np.ndarray | None = None
 
+    def _look_wider(self, tree: small_gicp.KdTree) -> None:
+        """Give points whose neighbours are a line the normal of more of them.
+
+        Rings across a corridor's floor and ceiling are all that holds a scanner's height and tilt there.
+        """
+        if self.solid.mean() < 1 - SPARSE:  # then the covariances of all, too
+            small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
+        on_line = np.flatnonzero(~self.solid)
+        if len(on_line) == 0:
+            return
+        near = self.points[tree.batch_knn_search(self.points[on_line], MANY_NEIGHBOURS)[0].astype(np.int64)]
+        values, vectors = np.linalg.eigh(scatter(near))
+        self.normals[on_line] = vectors[:, :, 0]
+        self.solid[on_line] = values[:, 1] > LINE * values[:, 2]
+
     def __len__(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def tilt(self) -> np.ndarray:
+        """(N,), rad: how far the neighbours of a point stray from their plane, seen from where they lie along it.
+
+        A normal is not wrong by more, whatever has made it wrong.
+        """
+        from scipy.spatial import cKDTree
+
+        values = np.linalg.eigvalsh(scatter(self.points[cKDTree(self.points).query(self.points, NEIGHBOURS)[1]]))
+        return np.sqrt(np.maximum(values[:, 0], 0) / np.maximum(values[:, 1], 1e-12))
 
     @cached_property
     def trust(self) -> np.ndarray:
@@ -81,13 +106,7 @@ class PreparedScan:
         At an edge, or where the neighbours are one ring of a spinning scanner, they fit no plane, and the normal there
         is the scanner's pattern, the same in every scan.
         """
-        from scipy.spatial import cKDTree
-
-        near = self.points[cKDTree(self.points).query(self.points, NEIGHBOURS)[1]]
-        arm = near - near.mean(1, keepdims=True)
-        values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", arm, arm))
-        tilt2 = np.maximum(values[:, 0], 0) / np.maximum(values[:, 1], 1e-12)  # variance of the normal, up to a factor
-        return 1 / (1 + (tilt2 / (TILT**2 * np.median(tilt2))) ** 2)
+        return 1 / (1 + (self.tilt / (TILT * max(np.median(self.tilt), CLEAN))) ** 4)
 
     @cached_property
     def few(self) -> np.ndarray:
@@ -115,14 +134,19 @@ class PreparedScan:
         return prepare(PointCloud(self.points))
 
 
-def lines(points: np.ndarray, tree: small_gicp.KdTree, count: int, which: np.ndarray | None = None) -> np.ndarray:
-    """Whether the ``count`` nearest neighbours of points (N, 3), or of some of them, lie on a line.
+def scatter(near: np.ndarray) -> np.ndarray:
+    """(N, 3, 3): the covariances of N neighbourhoods (N, k, 3)."""
+    arm = near - near.mean(1, keepdims=True)
+    return np.einsum("nki,nkj->nij", arm, arm) / near.shape[1]
+
+
+def lines(points: np.ndarray, tree: small_gicp.KdTree, count: int) -> np.ndarray:
+    """Whether the ``count`` nearest neighbours of points (N, 3) lie on a line.
 
     By the invariants of their covariance: the sum of its principal minors over its squared trace is r / (1 + r)² for
     principal variances 1, r, 0.
     """
-    asked = points if which is None else points[which]
-    near = points[tree.batch_knn_search(asked, count)[0].astype(np.int64)]
+    near = points[tree.batch_knn_search(points, count)[0].astype(np.int64)]
     x, y, z = (near - near.mean(1, keepdims=True)).transpose(2, 0, 1)
     xx, yy, zz, xy, xz, yz = (np.einsum("ij,ij->i", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
     minors = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
@@ -156,7 +180,7 @@ def suitable_voxel(points: np.ndarray) -> float:
 
     It leaves WORKING_POINTS at most, and POINTS_PER_VOXEL in each on average. Raises RegistrationError.
     """
-    wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
+    wanted = min(WORKING_POINTS, int(len(points) / POINTS_PER_VOXEL))
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
     if not spread > 0 or wanted < MIN_POINTS:
         raise RegistrationError("too few points, or all in one place")
@@ -186,8 +210,6 @@ def grain(points: np.ndarray) -> tuple[float, float]:
         return 0.0, 0.0
     points = thinned.points()[:, :3]
     index, squared = small_gicp.KdTree(thinned).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
-    near = points[index.astype(np.int64)]
-    arm = near - near.mean(1, keepdims=True)
-    values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", arm, arm) / NEIGHBOURS)
+    values = np.linalg.eigvalsh(scatter(points[index.astype(np.int64)]))
     flat = np.maximum(values[values[:, 1] > LINE * values[:, 2], 0], 0)
     return float(np.sqrt(np.median(squared[:, -1]))), float(np.sqrt(np.quantile(flat, 0.25))) if len(flat) else 0.0
