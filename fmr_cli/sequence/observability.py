@@ -60,7 +60,8 @@ class Observability:
     their root mean square distance from it, which turns radians into displacement.
     directions: (6, 6), a twist a column, independent of each other in the data. reliability: (6,), the share of each
     one's information that is real, 0 where hardly any point contributes. information: (6, 6) of a twist, rad⁻² and
-    voxel⁻², of the observed directions together.
+    voxel⁻², of the observed directions together. hint: the least reliability where normals are believed as far as their
+    neighbours bear them out: enough for a pose that something else speaks for as well.
     """
 
     centre: np.ndarray
@@ -68,6 +69,7 @@ class Observability:
     directions: np.ndarray
     reliability: np.ndarray
     information: np.ndarray
+    hint: float = 1.0
 
     @property
     def observed(self) -> np.ndarray:

@@ -60,13 +60,10 @@ class PlaneMap:
         solid: np.ndarray,
         T: np.ndarray,
         slope: float,
-        widths: tuple[float, ...] = (),
     ) -> tuple[np.ndarray, float, float, Matches | None]:
         """The pose near T of points with unit normals (N, 3), seen at ranges (N,); a normal is right where solid (N,).
 
-        slope: how residuals grow with range in this sensor's scans, see ``trust``. widths: voxels, the least sigma of
-        the first rounds, so that few points that face a direction draw the pose from further off (graduated
-        non-convexity, Black & Rangarajan 1996), each round nearer. Returns the pose, the RMS distance
+        slope: how residuals grow with range in this sensor's scans, see ``trust``. Returns the pose, the RMS distance
         from the planes, this scan's own slope, and what was matched; T as it was, NaN and None where too few points lie
         on planes.
         """
@@ -80,7 +77,7 @@ class PlaneMap:
         band = np.searchsorted(edges, ranges)
         middle = np.log(np.quantile(ranges, (np.arange(BANDS) + 0.5) / BANDS) + 1e-9)
         first = np.zeros(6)
-        for width in (*widths, *[MIN_SIGMA] * ROUNDS):
+        for _ in range(ROUNDS):
             found, squared = self.tree.batch_nearest_neighbor_search(transform_points(T, points))
             plane = np.array(found)
             on = solid & (np.array(squared) < REACH**2) & self.flat[plane]
@@ -95,13 +92,13 @@ class PlaneMap:
                 r, J = linearise(moved, offset, n, np.zeros(3))
                 if again == 0:
                     sigma = scale_by_band(np.abs(r), b)
-                    worth, scale2 = trust(sigma, slope)[b], (KERNEL * np.maximum(sigma, width)[b]) ** 2
+                    worth, scale2 = trust(sigma, slope)[b], (KERNEL * sigma[b]) ** 2
                 weight = worth * geman_mcclure(r * r, scale2)
                 H, gradient = normal_equations(J, r, weight)
                 step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -gradient)
                 T = step_motion(step) @ T
                 first = step if again == 0 else first
-            if width == MIN_SIGMA and (np.abs(first) < STILL).all():
+            if (np.abs(first) < STILL).all():
                 break
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0

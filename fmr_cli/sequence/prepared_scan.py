@@ -34,9 +34,8 @@ MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that th
 # would do, and the one that noise picks is the scanner's pattern, which holds the scan where the map's keyframe stood.
 LINE = 0.1
 SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from which more neighbours are asked
-TILT = 3.0  # times the scan's median error, at which a normal is half trusted ...
-CLEAN = 0.05  # ... which counts as at least so much, rad: beside flawless walls an edge is no worse than elsewhere
-FEW = 512  # points that a scan's global feature is made of: enough to tell poses apart, 2 ms
+TILT = 3.0  # times the scan's median error, at which a normal is half trusted
+FEW = 256  # points that a scan's global feature is made of: enough to tell poses apart, 1 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
 # Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
 # no surface, and on coarser ones a scan slides.
@@ -58,12 +57,13 @@ class PreparedScan:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels."""
         # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
         self.cloud = small_gicp.PointCloud(small_gicp.voxelgrid_sampling(points, 1.0).points())
+        self.points = np.ascontiguousarray(self.cloud.points()[:, :3])
         tree = small_gicp.KdTree(self.cloud)
         small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=NEIGHBOURS)
-        self.points = self.cloud.points()[:, :3]
-        self.normals = self.cloud.normals()[:, :3]
-        self.solid = ~lines(self.points, tree, NEIGHBOURS)
-        if len(self.points) > MANY_NEIGHBOURS:
+        self.normals = np.ascontiguousarray(self.cloud.normals()[:, :3])
+        self._scatter = scatter(self.points, neighbours(tree, self.points, NEIGHBOURS))
+        self.solid = ~lines(self._scatter)
+        if len(self.points) > MANY_NEIGHBOURS and not self.solid.all():
             self._look_wider(tree)
         rays = self.points - sensor
         self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
@@ -78,35 +78,26 @@ class PreparedScan:
         if self.solid.mean() < 1 - SPARSE:  # then the covariances of all, too
             small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
         on_line = np.flatnonzero(~self.solid)
-        if len(on_line) == 0:
-            return
-        near = self.points[tree.batch_knn_search(self.points[on_line], MANY_NEIGHBOURS)[0].astype(np.int64)]
-        values, vectors = np.linalg.eigh(scatter(near))
-        self.normals[on_line] = vectors[:, :, 0]
-        self.solid[on_line] = values[:, 1] > LINE * values[:, 2]
+        wider = scatter(self.points, neighbours(tree, self.points[on_line], MANY_NEIGHBOURS))
+        self.normals[on_line] = np.linalg.eigh(matrices(wider))[1][:, :, 0]
+        self.solid[on_line] = ~lines(wider)
 
     def __len__(self) -> int:
         return len(self.points)
 
     @cached_property
     def tilt(self) -> np.ndarray:
-        """(N,), rad: how far the neighbours of a point stray from their plane, seen from where they lie along it.
-
-        A normal is not wrong by more, whatever has made it wrong.
-        """
-        from scipy.spatial import cKDTree
-
-        values = np.linalg.eigvalsh(scatter(self.points[cKDTree(self.points).query(self.points, NEIGHBOURS)[1]]))
+        """(N,), rad: how far the neighbours of a point stray from their plane, seen from where they lie along it."""
+        values = np.linalg.eigvalsh(matrices(self._scatter))
         return np.sqrt(np.maximum(values[:, 0], 0) / np.maximum(values[:, 1], 1e-12))
 
-    @cached_property
-    def trust(self) -> np.ndarray:
-        """(N,), 0 to 1: how far a normal can be trusted, beside those of the same scan.
+    def trust(self, at_least: float = 0.0) -> np.ndarray:
+        """(N,), 0 to 1: how far a normal can be trusted, beside the median of the same scan, or a tilt ``at_least``.
 
         At an edge, or where the neighbours are one ring of a spinning scanner, they fit no plane, and the normal there
         is the scanner's pattern, the same in every scan.
         """
-        return 1 / (1 + (self.tilt / (TILT * max(np.median(self.tilt), CLEAN))) ** 4)
+        return 1 / (1 + (self.tilt / (TILT * max(np.median(self.tilt), at_least))) ** 4)
 
     @cached_property
     def few(self) -> np.ndarray:
@@ -134,21 +125,31 @@ class PreparedScan:
         return prepare(PointCloud(self.points))
 
 
-def scatter(near: np.ndarray) -> np.ndarray:
-    """(N, 3, 3): the covariances of N neighbourhoods (N, k, 3)."""
-    arm = near - near.mean(1, keepdims=True)
-    return np.einsum("nki,nkj->nij", arm, arm) / near.shape[1]
+def neighbours(tree: small_gicp.KdTree, points: np.ndarray, count: int) -> np.ndarray:
+    """(N, count), int64: which points of the tree are nearest to points (N, 3)."""
+    return tree.batch_knn_search(points, count)[0].astype(np.int64)
 
 
-def lines(points: np.ndarray, tree: small_gicp.KdTree, count: int) -> np.ndarray:
-    """Whether the ``count`` nearest neighbours of points (N, 3) lie on a line.
+def scatter(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """(6, N): xx, yy, zz, xy, xz, yz of the covariances of neighbourhoods near (N, k), indices of points (M, 3)."""
+    x, y, z = (np.ascontiguousarray(column)[near.T] for column in points.T)
+    for of_axis in (x, y, z):
+        of_axis -= of_axis.mean(0)
+    pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
+    return np.stack([np.einsum("ij,ij->j", a, b) for a, b in pairs]) / near.shape[1]
 
-    By the invariants of their covariance: the sum of its principal minors over its squared trace is r / (1 + r)² for
-    principal variances 1, r, 0.
+
+def matrices(six: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of ``scatter``."""
+    return six[[0, 3, 4, 3, 1, 5, 4, 5, 2]].T.reshape(-1, 3, 3)
+
+
+def lines(six: np.ndarray) -> np.ndarray:
+    """(N,), whether neighbourhoods lie on a line, by the invariants of their covariances (``scatter``).
+
+    The sum of the principal minors over the squared trace is r / (1 + r)² for principal variances 1, r, 0.
     """
-    near = points[tree.batch_knn_search(points, count)[0].astype(np.int64)]
-    x, y, z = (near - near.mean(1, keepdims=True)).transpose(2, 0, 1)
-    xx, yy, zz, xy, xz, yz = (np.einsum("ij,ij->i", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
+    xx, yy, zz, xy, xz, yz = six
     minors = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
     return minors < LINE / (1 + LINE) ** 2 * (xx + yy + zz) ** 2
 
@@ -210,6 +211,6 @@ def grain(points: np.ndarray) -> tuple[float, float]:
         return 0.0, 0.0
     points = thinned.points()[:, :3]
     index, squared = small_gicp.KdTree(thinned).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
-    values = np.linalg.eigvalsh(scatter(points[index.astype(np.int64)]))
+    values = np.linalg.eigvalsh(matrices(scatter(points, index.astype(np.int64))))
     flat = np.maximum(values[values[:, 1] > LINE * values[:, 2], 0], 0)
     return float(np.sqrt(np.median(squared[:, -1]))), float(np.sqrt(np.quantile(flat, 0.25))) if len(flat) else 0.0
