@@ -152,6 +152,8 @@ class LocalMap:
             return clear
         which = matches.index
         seen = observe(matches, scan.trust()[which], np.full(len(which), wrong))
+        if seen.observed.all():
+            return seen
         # Beside flawless walls an edge is no worse than elsewhere, and normals no more wrong than their neighbours say.
         hint = observe(matches, scan.trust(WRONG)[which], np.minimum(wrong, TILTED * scan.tilt[which]))
         return replace(seen, hint=float(hint.reliability.min()))

@@ -99,6 +99,7 @@ class Odometry:
         self.errors: deque[float] = deque(maxlen=ERRORS_KEPT)  # voxels, of the last predictions
         self.usual: deque[tuple[float, float]] = deque(maxlen=FITS_KEPT)  # overlap and total of aligned frames
         self.slopes: deque[float] = deque(maxlen=FITS_KEPT)  # see ``plane_map.trust``
+        self.by_features: tuple[int, PreparedScan, Registration] | None = None  # the last scan onto that one
         self.best_total = np.inf  # of the fits since the last keyframe
         self.index = 0
 
@@ -191,8 +192,11 @@ class Odometry:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
         from fmr_cli.registration import align
 
-        _, last, T_map_last = self.last
-        found = align(scan.for_align, last.for_align, replace(self.pair, init="features"), hints=False)
+        index, last, T_map_last = self.last
+        if self.by_features is None or self.by_features[:2] != (index, scan):  # asked twice at a doubtful frame
+            found = align(scan.for_align, last.for_align, replace(self.pair, init="features"), hints=False)
+            self.by_features = index, scan, found
+        found = self.by_features[2]
         return found, T_map_last @ found.T_target_source
 
     def _fits(self, fit: Fit) -> bool:
