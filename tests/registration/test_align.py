@@ -172,8 +172,8 @@ def test_a_wrong_pose_that_is_given_is_not_called_aligned(turned: tuple[Prepared
 
 def test_a_corridor_is_named() -> None:
     rng = np.random.default_rng(0)
-    along, across = rng.uniform(-4, 4, 20_000), rng.uniform(-1, 1, 20_000)
-    side = rng.integers(0, 4, 20_000)
+    along, across = rng.uniform(-4, 4, 8_000), rng.uniform(-1, 1, 8_000)
+    side = rng.integers(0, 4, 8_000)
     walls = np.choose(side[:, None], [np.stack(w, 1) for w in (
         (along, across, 0 * along - 1), (along, across, 0 * along + 1),
         (along, 0 * along - 1, across), (along, 0 * along + 1, across),
