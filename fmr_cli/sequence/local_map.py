@@ -33,6 +33,9 @@ MAP_KEYFRAMES = 20
 # than a counterpart costs at the end of the reach that still fits.
 OUTLIER_COST = 4.0
 EVERY = 100  # points of a scan, of which one says how far it has moved since a keyframe
+# Of how far the neighbours stray from a plane (``PreparedScan.tilt``), what a normal may be wrong by: ten neighbours
+# that stray each for itself leave 1 / sqrt(10 - 3) of it, a little more is allowed for what they share.
+TILTED = 0.5
 NO_LRU = 1 << 30  # insertions after which small_gicp would forget a voxel: never
 
 
@@ -144,7 +147,16 @@ class LocalMap:
 
     def _seen(self, scan: PreparedScan, T_map_scan: np.ndarray, matches: Matches) -> Observability:
         wrong = WRONG_STANDING if self.moved(scan, T_map_scan) < STANDING else WRONG
-        return clearly_observed(matches, wrong) or observe(matches, scan.trust[matches.index], wrong)
+        clear = clearly_observed(matches, wrong)
+        if clear:
+            return clear
+        which = matches.index
+        seen = observe(matches, scan.trust()[which], np.full(len(which), wrong))
+        if seen.observed.all():
+            return seen
+        # Beside flawless walls an edge is no worse than elsewhere, and normals no more wrong than their neighbours say.
+        hint = observe(matches, scan.trust(WRONG)[which], np.minimum(wrong, TILTED * scan.tilt[which]))
+        return replace(seen, hint=float(hint.reliability.min()))
 
     def moved(self, scan: PreparedScan, T_map_scan: np.ndarray) -> float:
         """Voxels, on average, from where the nearest of the keyframes stood."""

@@ -60,7 +60,8 @@ class Observability:
     their root mean square distance from it, which turns radians into displacement.
     directions: (6, 6), a twist a column, independent of each other in the data. reliability: (6,), the share of each
     one's information that is real, 0 where hardly any point contributes. information: (6, 6) of a twist, rad⁻² and
-    voxel⁻², of the observed directions together.
+    voxel⁻², of the observed directions together. hint: the least reliability where normals are believed as far as their
+    neighbours bear them out: enough for a pose that something else speaks for as well.
     """
 
     centre: np.ndarray
@@ -68,6 +69,7 @@ class Observability:
     directions: np.ndarray
     reliability: np.ndarray
     information: np.ndarray
+    hint: float = 1.0
 
     @property
     def observed(self) -> np.ndarray:
@@ -147,12 +149,13 @@ def clearly_observed(matches: Matches, wrong: float) -> Observability | None:
     return jacobians.observability(H, cross, matches.rms).as_observed()
 
 
-def observe(matches: Matches, trust: np.ndarray, wrong: float) -> Observability:
-    """The same, however weak; trust: (N,), 0 to 1, in their normals."""
+def observe(matches: Matches, trust: np.ndarray, wrong: np.ndarray) -> Observability:
+    """The same, however weak; trust: (N,), 0 to 1, in their normals; wrong: (N,), rad, what these are wrong by."""
     jacobians = Jacobians.of(matches, matches.weight * trust)
     H, cross = jacobians.information()
     arm = (matches.moved - jacobians.centre) / jacobians.radius
-    return jacobians.observability(H + wrong**2 * across(arm, jacobians), cross, matches.rms)
+    pretended = across(arm, replace(jacobians, weight=jacobians.weight * wrong**2))
+    return jacobians.observability(H + pretended, cross, matches.rms)
 
 
 def across(arm: np.ndarray, jacobians: Jacobians) -> np.ndarray:

@@ -21,6 +21,7 @@ from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
+from fmr_cli.sequence.observability import RELIABLE
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
@@ -52,8 +53,8 @@ FINEST = 0.05
 MATTERS = 0.5
 # Voxels along an unobserved direction, to either side: from there starts find back to one pose, to within SAME voxels,
 # where more shows it than normals tell, as trunks and leaves do. In tunnels and before blank walls they stay where they
-# are. HINTED: of the information along it, what must be real all the same.
-ASIDE, SAME, HINTED = 2.0, 0.1, 0.35
+# are. What they come back to must be observed all the same where normals are believed (``Observability.hint``).
+ASIDE, SAME = 2.0, 0.1
 ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
@@ -98,6 +99,7 @@ class Odometry:
         self.errors: deque[float] = deque(maxlen=ERRORS_KEPT)  # voxels, of the last predictions
         self.usual: deque[tuple[float, float]] = deque(maxlen=FITS_KEPT)  # overlap and total of aligned frames
         self.slopes: deque[float] = deque(maxlen=FITS_KEPT)  # see ``plane_map.trust``
+        self.by_features: tuple[int, PreparedScan, Registration] | None = None  # the last scan onto that one
         self.best_total = np.inf  # of the fits since the last keyframe
         self.index = 0
 
@@ -190,8 +192,11 @@ class Odometry:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
         from fmr_cli.registration import align
 
-        _, last, T_map_last = self.last
-        found = align(scan.for_align, last.for_align, replace(self.pair, init="features"), hints=False)
+        index, last, T_map_last = self.last
+        if self.by_features is None or self.by_features[:2] != (index, scan):  # asked twice at a doubtful frame
+            found = align(scan.for_align, last.for_align, replace(self.pair, init="features"), hints=False)
+            self.by_features = index, scan, found
+        found = self.by_features[2]
         return found, T_map_last @ found.T_target_source
 
     def _fits(self, fit: Fit) -> bool:
@@ -233,9 +238,10 @@ class Odometry:
         if elsewhere is not None:
             return elsewhere
         held = replace(fit, T_map_scan=self.motion.combined(fit.T_map_scan, expected, fit.seen))
-        between = self._found_from_both_sides(scan, held, usual_slope)
-        if between is not None:
-            return between
+        for middle in [fit, held] if fit.seen.hint >= RELIABLE else [held]:
+            between = self._found_from_both_sides(scan, middle, usual_slope)
+            if between is not None:
+                return between
         there, _ = self.map.polish(scan, held, usual_slope)
         if there.seen is None:
             return replace(held, seen=fit.seen)
@@ -267,17 +273,17 @@ class Odometry:
                 return other
         return None
 
-    def _found_from_both_sides(self, scan: PreparedScan, held: Fit, slope: float) -> Fit | None:
-        """The one pose to which starts ASIDE of the prediction along every unobserved direction come back.
+    def _found_from_both_sides(self, scan: PreparedScan, middle: Fit, slope: float) -> Fit | None:
+        """The one pose to which starts ASIDE of the middle along every unobserved direction come back.
 
         Not where a keyframe stood: the scanner's own pattern brings a scan back to there.
         """
-        assert held.seen
+        assert middle.seen
         found: Fit | None = None
-        for start in held.seen.aside(held.T_map_scan, ASIDE):
-            fit = self.map.fit(scan, start, (COARSE, FINE), held.start)
+        for start in middle.seen.aside(middle.T_map_scan, ASIDE):
+            fit = self.map.fit(scan, start, (COARSE, FINE), middle.start)
             fit, _ = self.map.polish(scan, fit, slope)
-            if fit.seen is None or fit.seen.reliability.min() < HINTED or not self._fits(fit):
+            if fit.seen is None or fit.seen.hint < RELIABLE or not self._fits(fit):
                 return None
             if displacement(fit.T_map_scan, (found or fit).T_map_scan, scan.points) > SAME:
                 return None

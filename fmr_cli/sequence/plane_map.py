@@ -79,14 +79,17 @@ class PlaneMap:
         first = np.zeros(6)
         for _ in range(ROUNDS):
             found, squared = self.tree.batch_nearest_neighbor_search(transform_points(T, points))
-            plane = np.array(found)
-            on = solid & (np.array(squared) < REACH**2) & self.flat[plane]
-            cosine = np.einsum("ij,ij->i", self.normals[plane], normals @ T[:3, :3].T)
-            on &= (np.abs(cosine) if self.two_sided else cosine) > AGREE
-            if on.sum() < 6 * BANDS:
+            plane = np.asarray(found, np.int64)
+            on = np.flatnonzero(solid & (np.asarray(squared) < REACH**2) & self.flat[plane])
+            plane, n = plane[on], self.normals[plane[on]]
+            cosine = np.einsum("ij,ij->i", n, normals[on] @ T[:3, :3].T)
+            agree = (np.abs(cosine) if self.two_sided else cosine) > AGREE
+            on, plane, n, cosine = on[agree], plane[agree], n[agree], cosine[agree]
+            if len(on) < 6 * BANDS:
                 return T, float("nan"), float("nan"), None
-            p, offset, b = points[on], self.means[plane[on]], band[on]
-            n = self.normals[plane[on]] * np.sign(cosine[on])[:, None]
+            p, offset, b = points[on], self.means[plane], band[on]
+            if self.two_sided:
+                n = n * np.sign(cosine)[:, None]
             for again in range(STEPS):
                 moved = transform_points(T, p)
                 r, J = linearise(moved, offset, n, np.zeros(3))
@@ -103,7 +106,7 @@ class PlaneMap:
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
         rms = float(np.sqrt((weight * r**2).sum() / weight.sum()))
-        return T, rms, own, Matches(np.flatnonzero(on), moved, normals[on] @ T[:3, :3].T, n, weight / worth, rms)
+        return T, rms, own, Matches(on, moved, normals[on] @ T[:3, :3].T, n, weight / worth, rms)
 
 
 def scale_by_band(r: np.ndarray, band: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
-POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold noise
+POINTS_PER_VOXEL = 1.4  # of a scan that has few points, on average: finer voxels would hold single points
 # Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
 # they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
 HELD = 2.2
@@ -35,7 +35,7 @@ MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that th
 LINE = 0.1
 SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from which more neighbours are asked
 TILT = 3.0  # times the scan's median error, at which a normal is half trusted
-FEW = 512  # points that a scan's global feature is made of: enough to tell poses apart, 2 ms
+FEW = 256  # points that a scan's global feature is made of: enough to tell poses apart, 1 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
 # Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
 # no surface, and on coarser ones a scan slides.
@@ -57,37 +57,47 @@ class PreparedScan:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels."""
         # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
         self.cloud = small_gicp.PointCloud(small_gicp.voxelgrid_sampling(points, 1.0).points())
+        self.points = np.ascontiguousarray(self.cloud.points()[:, :3])
         tree = small_gicp.KdTree(self.cloud)
         small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=NEIGHBOURS)
-        self.points = self.cloud.points()[:, :3]
-        self.normals = self.cloud.normals()[:, :3]
-        self.solid = ~lines(self.points, tree, NEIGHBOURS)
-        if self.solid.mean() < 1 - SPARSE and len(self.points) > MANY_NEIGHBOURS:
-            small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
-            self.normals = np.where(self.solid[:, None], self.normals, self.cloud.normals()[:, :3])
-            self.solid[~self.solid] = ~lines(self.points, tree, MANY_NEIGHBOURS, np.flatnonzero(~self.solid))
+        self.normals = np.ascontiguousarray(self.cloud.normals()[:, :3])
+        self._scatter = scatter(self.points, neighbours(tree, self.points, NEIGHBOURS))
+        self.solid = ~lines(self._scatter)
+        if len(self.points) > MANY_NEIGHBOURS and not self.solid.all():
+            self._look_wider(tree)
         rays = self.points - sensor
         self.normals[np.einsum("ij,ij->i", self.normals, rays) > 0] *= -1
         self.ranges = np.linalg.norm(rays, axis=1)
         self._feature: np.ndarray | None = None
 
+    def _look_wider(self, tree: small_gicp.KdTree) -> None:
+        """Give points whose neighbours are a line the normal of more of them.
+
+        Rings across a corridor's floor and ceiling are all that holds a scanner's height and tilt there.
+        """
+        if self.solid.mean() < 1 - SPARSE:  # then the covariances of all, too
+            small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
+        on_line = np.flatnonzero(~self.solid)
+        wider = scatter(self.points, neighbours(tree, self.points[on_line], MANY_NEIGHBOURS))
+        self.normals[on_line] = np.linalg.eigh(matrices(wider))[1][:, :, 0]
+        self.solid[on_line] = ~lines(wider)
+
     def __len__(self) -> int:
         return len(self.points)
 
     @cached_property
-    def trust(self) -> np.ndarray:
-        """(N,), 0 to 1: how far a normal can be trusted, beside those of the same scan.
+    def tilt(self) -> np.ndarray:
+        """(N,), rad: how far the neighbours of a point stray from their plane, seen from where they lie along it."""
+        least, middle, _ = principal_variances(self._scatter)
+        return np.sqrt(np.maximum(least, 0) / np.maximum(middle, 1e-12))
+
+    def trust(self, at_least: float = 0.0) -> np.ndarray:
+        """(N,), 0 to 1: how far a normal can be trusted, beside the median of the same scan, or a tilt ``at_least``.
 
         At an edge, or where the neighbours are one ring of a spinning scanner, they fit no plane, and the normal there
         is the scanner's pattern, the same in every scan.
         """
-        from scipy.spatial import cKDTree
-
-        near = self.points[cKDTree(self.points).query(self.points, NEIGHBOURS)[1]]
-        arm = near - near.mean(1, keepdims=True)
-        values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", arm, arm))
-        tilt2 = np.maximum(values[:, 0], 0) / np.maximum(values[:, 1], 1e-12)  # variance of the normal, up to a factor
-        return 1 / (1 + (tilt2 / (TILT**2 * np.median(tilt2))) ** 2)
+        return 1 / (1 + (self.tilt / (TILT * max(np.median(self.tilt), at_least))) ** 4)
 
     @cached_property
     def few(self) -> np.ndarray:
@@ -115,16 +125,43 @@ class PreparedScan:
         return prepare(PointCloud(self.points))
 
 
-def lines(points: np.ndarray, tree: small_gicp.KdTree, count: int, which: np.ndarray | None = None) -> np.ndarray:
-    """Whether the ``count`` nearest neighbours of points (N, 3), or of some of them, lie on a line.
+def neighbours(tree: small_gicp.KdTree, points: np.ndarray, count: int) -> np.ndarray:
+    """(N, count), int64: which points of the tree are nearest to points (N, 3)."""
+    return tree.batch_knn_search(points, count)[0].astype(np.int64)
 
-    By the invariants of their covariance: the sum of its principal minors over its squared trace is r / (1 + r)² for
-    principal variances 1, r, 0.
+
+def scatter(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """(6, N): xx, yy, zz, xy, xz, yz of the covariances of neighbourhoods near (N, k), indices of points (M, 3)."""
+    x, y, z = (np.ascontiguousarray(column)[near.T] for column in points.T)
+    for of_axis in (x, y, z):
+        of_axis -= of_axis.mean(0)
+    pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
+    return np.stack([np.einsum("ij,ij->j", a, b) for a, b in pairs]) / near.shape[1]
+
+
+def matrices(six: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of ``scatter``."""
+    return six[[0, 3, 4, 3, 1, 5, 4, 5, 2]].T.reshape(-1, 3, 3)
+
+
+def principal_variances(six: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The eigenvalues of ``scatter``, (N,) each, ascending: in closed form, a fifth of LAPACK's time (Smith 1961)."""
+    xx, yy, zz, xy, xz, yz = six
+    mean = (xx + yy + zz) / 3
+    a, b, c = xx - mean, yy - mean, zz - mean
+    radius = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    half_det = (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)) / 2
+    angle = np.arccos(np.clip(half_det / np.maximum(radius**3, 1e-300), -1, 1)) / 3
+    most, least = mean + 2 * radius * np.cos(angle), mean + 2 * radius * np.cos(angle + 2 * np.pi / 3)
+    return least, 3 * mean - most - least, most
+
+
+def lines(six: np.ndarray) -> np.ndarray:
+    """(N,), whether neighbourhoods lie on a line, by the invariants of their covariances (``scatter``).
+
+    The sum of the principal minors over the squared trace is r / (1 + r)² for principal variances 1, r, 0.
     """
-    asked = points if which is None else points[which]
-    near = points[tree.batch_knn_search(asked, count)[0].astype(np.int64)]
-    x, y, z = (near - near.mean(1, keepdims=True)).transpose(2, 0, 1)
-    xx, yy, zz, xy, xz, yz = (np.einsum("ij,ij->i", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
+    xx, yy, zz, xy, xz, yz = six
     minors = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
     return minors < LINE / (1 + LINE) ** 2 * (xx + yy + zz) ** 2
 
@@ -156,7 +193,7 @@ def suitable_voxel(points: np.ndarray) -> float:
 
     It leaves WORKING_POINTS at most, and POINTS_PER_VOXEL in each on average. Raises RegistrationError.
     """
-    wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
+    wanted = min(WORKING_POINTS, int(len(points) / POINTS_PER_VOXEL))
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
     if not spread > 0 or wanted < MIN_POINTS:
         raise RegistrationError("too few points, or all in one place")
@@ -186,8 +223,6 @@ def grain(points: np.ndarray) -> tuple[float, float]:
         return 0.0, 0.0
     points = thinned.points()[:, :3]
     index, squared = small_gicp.KdTree(thinned).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
-    near = points[index.astype(np.int64)]
-    arm = near - near.mean(1, keepdims=True)
-    values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", arm, arm) / NEIGHBOURS)
-    flat = np.maximum(values[values[:, 1] > LINE * values[:, 2], 0], 0)
+    least, middle, most = principal_variances(scatter(points, index.astype(np.int64)))
+    flat = np.maximum(least[middle > LINE * most], 0)
     return float(np.sqrt(np.median(squared[:, -1]))), float(np.sqrt(np.quantile(flat, 0.25))) if len(flat) else 0.0
