@@ -34,8 +34,8 @@ def certain(found):
     ("things", "noise"),
     [
         ([tunnel(4.0)], 0.02),
-        ([tunnel(4.0)], 0.003),
-        ([wall(1, 1.2), wall(1, -1.2), wall(2, -1.2), wall(2, 1.4)], 0.01),
+        pytest.param([tunnel(4.0)], 0.003, marks=pytest.mark.slow),
+        pytest.param([wall(1, 1.2), wall(1, -1.2), wall(2, -1.2), wall(2, 1.4)], 0.01, marks=pytest.mark.slow),
     ],
     ids=["tunnel", "tunnel, a clean scanner", "corridor"],
 )
@@ -59,6 +59,7 @@ def test_open_ground_leaves_three_motions_open():
     assert "rotation about (0.00, 0.00, 1.00)" in found.rows[1]["unobserved"]
 
 
+@pytest.mark.slow
 def test_through_a_tunnel_it_goes_on_as_it_came_and_says_where_it_did_not_see():
     """Parked cars before and behind 30 m of tube, 1.2 m a frame; reach 15 m."""
     rng = np.random.default_rng(1)
