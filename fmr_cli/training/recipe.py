@@ -165,7 +165,9 @@ class ScanRecipe:
     temperature: float = 0.07  # of InfoNCE
     apart: float = 3.0  # voxel edges: nearer places are not each other's negatives
     learning_rate: float = 2e-3  # a minute has some hundred steps
-    stays: float = 0.4  # share of the start's weights in the mean that is kept, so that little is forgotten
+    stays: float = (
+        0.2  # share of the start's weights in the mean that is kept: by 0.4 half as much is forgotten and gained
+    )
     whole_every: int = 5  # one step in so many is the global encoder's; 0 leaves it as it is
     steps: int = 1200
     epoch_steps: int = 100
