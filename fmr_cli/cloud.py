@@ -33,6 +33,7 @@ class PointCloud:
     sensor_origin: (3,) float64 position of the sensor where the file states it, or None.
     las_header: the ``laspy.LasHeader`` of a LAS/LAZ file (scales, offsets, VLRs), so that it can be written again.
     left_out: what else the file holds and is not kept ("list property 'neighbours'", "element 'edge'").
+    notes: what is odd about the file, for a person to look at ("3 lines beyond the 100 points that ...").
     mesh: (vertices, faces) of the mesh whose surface was sampled, or None.
     scan, T_file_scan: of a file of several scans, the name of the one that the points are from, and its pose in the
         file's frame (4x4), in which the points are; None where the file tells no scans apart.
@@ -47,6 +48,7 @@ class PointCloud:
     sensor_origin: np.ndarray | None = None
     las_header: Any = None
     left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     mesh: tuple[int, int] | None = None
     layout: str | None = None
     total: int | None = None

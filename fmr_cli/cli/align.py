@@ -109,7 +109,7 @@ def align_command(
     elif not out:
         typer.echo(io.transform_text(T), nl=False)
     say(*export.summary(moving, fixed, found), quiet=quiet)
-    warn(*warnings, quiet=quiet)
+    warn(*dict.fromkeys(warnings), quiet=quiet)
     if view:
         from fmr_cli.report.view_window import view_pair
 

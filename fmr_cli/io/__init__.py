@@ -225,7 +225,8 @@ def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
     if stream.survey.count == 0:
         raise CloudFileError(f"{path}: there are no points to write")
     head = stream.survey.head
-    warnings = [f"{what} of {stream.name}: not kept" for what in head.left_out]
+    warnings = [f"{stream.name}: {note}" for note in head.notes]
+    warnings += [f"{what} of {stream.name}: not kept" for what in head.left_out]
     warnings += unturned(head.attributes) if stream.turned else []
     with atomic_write(path) as temporary:
         try:

@@ -34,6 +34,7 @@ def describe(cloud: PointCloud | CloudStream) -> dict[str, Any]:
         "crs": head.crs,
         "sensor_origin": None if head.sensor_origin is None else head.sensor_origin.tolist(),
         "left_out": list(head.left_out),
+        "notes": list(head.notes),
     }
 
 
@@ -108,4 +109,5 @@ def table(said: dict[str, Any]) -> str:
         "sensor": numbers(said["sensor_origin"]) if said["sensor_origin"] else "not stated",
         "left out": ", ".join(said["left_out"]) or "nothing",
     }
+    rows |= {"note": "; ".join(said["notes"])} if said["notes"] else {}
     return "\n".join([said["file"], *(f"  {name:<11}{text}" for name, text in rows.items())])

@@ -10,7 +10,8 @@ import os
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,7 +22,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import Field, fields_of, storable, to_cloud, unique
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
-from fmr_cli.io.table import MOST_COLUMNS, Lines, read_rows
+from fmr_cli.io.table import MOST_COLUMNS, Lines, beyond, read_rows
 
 LONGEST_HEADER = 1 << 20
 LINE_END = re.compile(rb"\r\n|\n|\r")
@@ -44,7 +45,8 @@ class Header:
 
 
 def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
-    with path.open("rb") as file:
+    with ExitStack() as stack:
+        file = stack.enter_context(path.open("rb"))
         header = read_header(file)
         left = os.path.getsize(path) - file.tell()
         width = header.fields.itemsize
@@ -60,18 +62,23 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
                 f"its header promises {header.points} points and the file is too short for them, "
                 "it is truncated or damaged: copy it again"
             )
-        for records in records_of(file, header):
-            yield cloud_of(records, header, wanted.attributes)
+        text = None
+        if header.encoding == "ascii":
+            text = Lines(stack.enter_context(TextIOWrapper(file, "utf-8", errors="replace")), header.lines)
+        for records in records_of(file, text, header):
+            cloud = cloud_of(records, header, wanted.attributes)
+            yield cloud
+        if text and (notes := beyond(text, header.points)):
+            yield replace(cloud.select(slice(0)), notes=notes)
 
 
-def records_of(file: BinaryIO, header: Header) -> Iterator[np.ndarray]:
+def records_of(file: BinaryIO, text: Lines | None, header: Header) -> Iterator[np.ndarray]:
     """The points as records of ``header.fields``, some at a time; at least one, which may be empty."""
     if header.points == 0:
         yield np.empty(0, header.fields)
-    elif header.encoding == "ascii":
-        with TextIOWrapper(file, "utf-8", errors="replace") as text:
-            for rows in read_rows(Lines(text, header.lines), np.dtype(flat_names(header.fields)), header.points):
-                yield np.frombuffer(rows.tobytes(), header.fields, len(rows))
+    elif text:
+        for rows in read_rows(text, np.dtype(flat_names(header.fields)), header.points):
+            yield np.frombuffer(rows.tobytes(), header.fields, len(rows))
     elif header.encoding == "binary":
         for start in range(0, header.points, CHUNK):
             yield np.fromfile(file, header.fields, min(CHUNK, header.points - start))

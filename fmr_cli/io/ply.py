@@ -20,7 +20,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import fields_of, storable, to_cloud, unique, write_records
 from fmr_cli.io.mesh import Mesh, fan
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted, collect
-from fmr_cli.io.table import MOST_COLUMNS, Lines, read_rows
+from fmr_cli.io.table import MOST_COLUMNS, Lines, beyond, read_rows
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -101,6 +101,9 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
                     else:
                         vertices.append(cloud)
                 if faces is None:
+                    later = header.elements[header.elements.index(element) + 1 :]
+                    if text and (notes := beyond(text, element.count, sum(e.count for e in later))):
+                        yield replace(cloud.select(slice(0)), notes=notes)
                     return
             else:
                 columns = join_columns(columns_of(file, text, element, header.order, lists=element.name == "face"))

@@ -70,10 +70,10 @@ class Survey:
 class CloudStream:
     """The points of a cloud in order, as clouds of at most some CHUNK points each. Can be run through again.
 
-    All chunks have the same attributes of the same types, and say the same of the whole but for ``dropped``, and
-    where a file has several scans, ``scan``, ``T_file_scan`` and ``sensor_origin``. turned: whether it is in another
-    orientation than its file, so that a write has to warn of what did not turn along. bare: the same points without
-    their attributes, where that takes less time.
+    All chunks have the same attributes of the same types, and say the same of the whole but for ``dropped``; ``notes``,
+    which a reader may make at the end; and where a file has several scans, ``scan``, ``T_file_scan`` and
+    ``sensor_origin``. turned: whether it is in another orientation than its file, so that a write has to warn of what
+    did not turn along. bare: the same points without their attributes, where that takes less time.
     """
 
     def __init__(
@@ -110,12 +110,14 @@ class CloudStream:
         count = dropped = 0
         low, high, rest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
         columns: dict[str, Column] = {}
+        notes: dict[str, None] = {}  # in order, each once
         for chunk in self:
             if head is None:
                 head = chunk.select(slice(0, 0))
                 columns = {name: Column(v.dtype, v.shape[1:]) for name, v in chunk.attributes.items()}
             elif chunk.scan != head.scan:
                 head.scan = head.T_file_scan = head.sensor_origin = None
+            notes |= dict.fromkeys(chunk.notes)
             dropped += chunk.dropped
             count += len(chunk)
             if not len(chunk):
@@ -133,7 +135,7 @@ class CloudStream:
             raise ValueError("a stream without a single chunk")
         if head.format in UNTYPED:
             narrow_colors(columns)
-        return Survey(replace(head, dropped=dropped), count, low, high, rest, columns)
+        return Survey(replace(head, dropped=dropped, notes=(*notes,)), count, low, high, rest, columns)
 
 
 def narrow_colors(columns: dict[str, Column]) -> None:
@@ -190,7 +192,8 @@ def collect(chunks: Iterable[PointCloud], at_most: int | None = None, seed: int 
         first = replace(first, scan=None, T_file_scan=None, sensor_origin=None)
     attributes = {name: joined([part.attributes.pop(name) for part in parts]) for name in [*parts[0].attributes]}
     points = joined([part.points for part in parts])
-    cloud = replace(first, points=points, attributes=attributes, dropped=dropped)
+    notes = dict.fromkeys(note for part in parts for note in part.notes)
+    cloud = replace(first, points=points, attributes=attributes, dropped=dropped, notes=(*notes,))
     cloud.total = first.total or (total if len(cloud) < total else None)
     if cloud.format in UNTYPED and set(COLORS) & set(attributes):
         columns = {name: Column(v.dtype, v.shape[1:]) for name, v in attributes.items() if name in (*COLORS, "alpha")}

@@ -246,6 +246,15 @@ def number_in(cell: str) -> float:
     raise ValueError(text)
 
 
+def beyond(lines: Lines, promised: int, others: int = 0) -> tuple[str, ...]:
+    """A note, where lines are left beyond the points that a header promises and ``others`` of other elements."""
+    left = sum(1 for _ in lines) - others
+    if left <= 0:
+        return ()
+    what = "1 line lies" if left == 1 else f"{left} lines lie"
+    return (f"{what} beyond the {promised} points that its header promises, not read: mend the header if it is wrong",)
+
+
 def read_rows(lines: Lines, dtype: np.dtype, count: int) -> Iterator[np.ndarray]:
     """``count`` lines of numbers between blanks (or commas) as records, some at a time.
 

@@ -31,6 +31,8 @@ HEAD = 200  # lines that are looked at to tell how the file is written
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 PTS = ("intensity", *COLORS)  # what a PTS line may hold after x y z, in that order
 PREAMBLE = 30  # lines before the names, at most
+FLAT = 100  # times as high as wide: a pole, or longitude and latitude with a height in metres
+DEGREES = "its x and y may be longitude and latitude, and degrees are no lengths: if so, project it first, to UTM say"
 SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
 
@@ -53,7 +55,7 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
         names = table.names or [f"column_{k + 1}" for k in range(len(table.dialect.used))]
         dtype = np.dtype([(name, np.float64) for name in names])
         bare: list[str] | None = None
-        done = 0
+        done, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
         rest = iter(lambda: lines.take(ROWS, COMMENTS), None)
         for rows in chain([head], rest):
             last = not rows.lines
@@ -70,13 +72,27 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
                 bare = bare_names(matrix[:, 3:]) if bare is None else bare
                 cloud = bare_cloud(matrix, bare, wanted.attributes)
             cloud.left_out = table.left_out
-            if not last or done == 0:
+            if len(cloud):
+                low, high = np.fmin(low, np.fmin.reduce(cloud.points)), np.fmax(high, np.fmax.reduce(cloud.points))
+            if last:
+                cloud.notes = (DEGREES,) if like_degrees(low, high) else ()
+            if not last or done == 0 or cloud.notes:
                 yield cloud
             if last:
                 break
     if table.promised is not None and done != table.promised:
         what = "it is truncated: copy it again" if done < table.promised else "its first line is no count: take it out"
         raise CloudFileError(f"promises {table.promised} points in its first line and holds {done}, {what}")
+
+
+def like_degrees(low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether x and y may be longitude and latitude, by the bounds (3,): within a globe's, and flat beside heights.
+
+    A degree is 111 km: what a scan spans of degrees is a hundredth at most of what it spans in height, in metres.
+    """
+    x, y, z = high - low
+    largest = np.sort(np.abs([low, high]).max(0)[:2])
+    return bool(largest[0] <= 90 and largest[1] <= 180 and 0 < max(x, y) < z / FLAT)
 
 
 def counts_between(rows: Rows) -> Iterator[int]:

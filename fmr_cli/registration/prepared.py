@@ -43,7 +43,8 @@ class Prepared:
         points = points[np.isfinite(points).all(1)]
         found = strays(points, np.random.default_rng(seed)) if len(points) else Strays(np.ones(0, bool), {})
         points = points[found.keep]
-        self.notes = [
+        self.notes = [f"{cloud.name}: {note}" for note in cloud.notes]
+        self.notes += [
             f"{cloud.name}: {n} points {why} are no surface, set aside" for why, n in found.reasons.items() if n
         ]
         self.frame = Frame(points.mean(0) if len(points) else np.zeros(3))

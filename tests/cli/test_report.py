@@ -54,12 +54,13 @@ def test_without_the_extra_the_remedy_is_said_before_anything_is_read(fmr, tmp_p
     assert "pip install 'fmr-cli[report]'" in done.stderr
 
 
-def test_align_imports_nothing_of_it_unasked(samples):
+def test_align_imports_nothing_of_it_unasked_nor_open3d_nor_torch(samples):
     code = (
         "import sys, runpy\n"
         f"sys.argv = ['fmr', 'align', *{[str(samples / f'scan_{x}.ply') for x in 'ab']!r}, '-q']\n"
         "try:\n    runpy.run_module('fmr_cli.cli', run_name='__main__')\nexcept SystemExit:\n    pass\n"
-        "print([m for m in ('jinja2', 'plotly', 'PIL', 'matplotlib', 'open3d', 'fmr_cli.report') if m in sys.modules])"
+        "heavy = ('jinja2', 'plotly', 'PIL', 'matplotlib', 'open3d', 'torch', 'fmr_cli.report')\n"
+        "print([m for m in heavy if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.stdout.splitlines()[-1] == "[]", done.stderr

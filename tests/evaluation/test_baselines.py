@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,14 +61,3 @@ def test_what_open3d_lacks_is_one_line_with_its_remedy(monkeypatch, error, said)
     there, missing = baselines.global_baselines(VOXEL)
     assert "FPFH + RANSAC" not in there
     assert any(line.startswith("no FPFH + RANSAC: Open3D") for line in missing)
-
-
-def test_registration_imports_neither_open3d_nor_torch():
-    samples = Path(__file__).parents[2] / "samples"
-    code = (
-        "import sys; from fmr_cli import align, read_cloud; align(*map(read_cloud, sys.argv[1:]));"
-        "sys.exit(str({'open3d', 'torch'} & set(sys.modules)) if {'open3d', 'torch'} & set(sys.modules) else 0)"
-    )
-    command = [sys.executable, "-c", code, str(samples / "scan_a.ply"), str(samples / "scan_b.ply")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr

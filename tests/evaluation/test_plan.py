@@ -36,6 +36,7 @@ def test_a_data_set_by_this_process_and_by_two_others(pairs):
     assert repr(here) == repr(there)
 
 
+@pytest.mark.slow
 def test_an_experiment_by_this_process_and_by_two_others():
     made = OnScans((SAMPLES,), Compared(align=False), None, pairs=2, points=64)
     here, there = (without_seconds(made.run(EXPERIMENTS["noise"], team)) for team in (Here(), Processes(2)))

@@ -12,7 +12,7 @@ import pytest
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io import read_cloud, write_cloud
+from fmr_cli.io import WRITABLE, open_cloud, read_cloud, write_cloud
 from fmr_cli.vectors import turn_vectors
 
 POINTS = [[1, 2.5, 3], [-4, 5, 600]]
@@ -295,3 +295,32 @@ def test_an_old_laszip_is_named_as_the_cause(tmp_path: Path) -> None:
     (tmp_path / "a.laz").write_bytes(data)
     with pytest.raises(CloudFileError, match="compressed by a LASzip of before 2011"):
         read_cloud(tmp_path / "a.laz")
+
+
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_lines_beyond_those_promised_are_counted(tmp_path: Path, kind: str) -> None:
+    """In an ascii PLY or PCD; a PLY's other elements are none, nor are blank lines."""
+    rows = "".join(f"{n} {n * n % 7} {n % 3}\n" for n in range(1, 41))
+    ply = PLY_HEAD.format("ascii").replace("vertex 2", "vertex {}").replace("end_header", "{}end_header")
+    pcd = PCD_HEAD.format("ascii").replace("WIDTH 2", "WIDTH {0}").replace("POINTS 2", "POINTS {0}")
+    edges = "element edge 2\nproperty int a\n"
+    path = tmp_path / f"a.{kind}"
+    for promised, left in ((40, 0), (39, 1), (30, 10), (0, 40)):
+        path.write_text((ply.format(promised, "") if kind == "ply" else pcd.format(promised)) + rows + "\n\n")
+        if promised == 0:
+            with pytest.raises(CloudFileError, match="holds no points"):
+                read_cloud(path)
+            continue
+        cloud = read_cloud(path)
+        assert len(cloud) == promised
+        expected = () if not left else (f"{left} line{'s lie' if left > 1 else ' lies'} beyond the {promised} points",)
+        assert [note.split(" that its")[0] for note in cloud.notes] == [*expected]
+    path.write_text((ply.format(30, edges) if kind == "ply" else pcd.format(30)) + rows)
+    (note,) = read_cloud(path).notes
+    assert note.startswith("8 lines" if kind == "ply" else "10 lines")
+    for suffix in WRITABLE:
+        if suffix == ".e57":
+            pytest.importorskip("pye57")
+        warnings = write_cloud(tmp_path / f"b{suffix}", open_cloud(path))
+        assert f"{path}: {note}" in warnings
+        assert len(read_cloud(tmp_path / f"b{suffix}")) == 30

@@ -6,6 +6,7 @@ import gzip
 import re
 from pathlib import Path
 
+import command
 import numpy as np
 import pytest
 
@@ -151,3 +152,20 @@ def test_gzip_is_read_and_does_not_unpack_without_end(tmp_path: Path) -> None:
 def test_a_written_csv_starts_no_formula(tmp_path: Path) -> None:
     write_cloud(tmp_path / "a.csv", PointCloud(np.eye(3), {"=cmd()": np.arange(3), "+a": np.arange(3)}))
     assert (tmp_path / "a.csv").read_text().splitlines()[0] == "x,y,z,_cmd(),_a"
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_what_may_be_degrees_is_said(tmp_path: Path, named: bool) -> None:
+    """A street of 100 m by Stuttgart in degrees and metres; the same in UTM; a column of half a metre and 6 m."""
+    rng = np.random.default_rng(0)
+    metres = rng.uniform(0, 1, (3000, 3)) * [100, 80, 12]
+    degrees = metres / [73_500, 111_200, 1] + [9.1829, 48.7758, 240]
+    column = metres / [200, 160, 2]
+    head = "x,y,z" if named else ""
+    for points, said in ((degrees, True), (degrees[:, [1, 0, 2]], True), (metres, False), (column, False)):
+        np.savetxt(tmp_path / "a.csv", points, delimiter=",", fmt="%.8f", header=head, comments="")
+        (note,) = read_cloud(tmp_path / "a.csv").notes or ("",)
+        assert ("longitude and latitude" in note) == said
+    np.savetxt(tmp_path / "a.csv", degrees, delimiter=",", fmt="%.8f", header=head, comments="")
+    done = command.here("align", "a.csv", "a.csv", "--init", "identity", cwd=tmp_path)
+    assert "warning: a.csv: its x and y may be" in done.stderr

@@ -148,7 +148,10 @@ def test_symmetries_map_the_endless_structure_onto_itself(name, seed):
             assert (to_surface(s, moved) < 1e-6).mean() > 0.97, name
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if k in repeating.MAKERS and k in UNIQUE])
+DETAILED = [kind for kind in KINDS if kind in repeating.MAKERS and kind in UNIQUE]
+
+
+@pytest.mark.parametrize("kind", [*DETAILED[:3], *(pytest.param(k, marks=pytest.mark.slow) for k in DETAILED[3:])])
 def test_details_show_in_both_scans_and_contradict_every_alias(kind, monkeypatch):
     seen = []
     keep = repeating.unique
