@@ -40,7 +40,7 @@ def street(tmp_path_factory):
     folder = tmp_path_factory.mktemp("street")
     rng, place, poses = np.random.default_rng(1), make_street(60), drive(60)[:8]
     for i, pose in enumerate(poses):
-        points = scan(place, pose, rng, columns=450)
+        points = scan(place, pose, rng, columns=250)
         write_cloud(folder / f"{i}.bin", PointCloud(points, {"intensity": np.full(len(points), i, np.float32)}))
     return folder, np.linalg.inv(poses[0]) @ poses
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
-POINTS_PER_VOXEL = 1.4  # of a scan that has few points, on average: finer voxels would hold single points
+POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold noise
 # Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
 # they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
 HELD = 2.2
@@ -193,7 +193,7 @@ def suitable_voxel(points: np.ndarray) -> float:
 
     It leaves WORKING_POINTS at most, and POINTS_PER_VOXEL in each on average. Raises RegistrationError.
     """
-    wanted = min(WORKING_POINTS, int(len(points) / POINTS_PER_VOXEL))
+    wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
     if not spread > 0 or wanted < MIN_POINTS:
         raise RegistrationError("too few points, or all in one place")

@@ -20,7 +20,7 @@ def street_drive():
     place, rng = make_street(60), np.random.default_rng(4)
     poses = drive(60, rest=0)[10:16]
     poses = np.concatenate([poses[:1], poses[:1], poses])
-    return [scan(place, pose, rng, columns=450) for pose in poses], poses
+    return [scan(place, pose, rng, columns=250) for pose in poses], poses
 
 
 def spoilt(scans, poses, how):
