@@ -55,11 +55,10 @@ MATTERS = 0.5
 # where more shows it than normals tell, as trunks and leaves do. In tunnels and before blank walls they stay where they
 # are, or go back to where a keyframe stood.
 ASIDE, SAME = 2.0, 0.1
-# What they come back to must be half as reliable as what stands alone, where normals are believed
-# (``Observability.hint``). By hand: in made-up pans over a blank wall (6 to 18 deg a frame), slides along one, corridors
-# and tunnels all such poses were within 0.12 voxels of the truth, at hints from 0 to 0.5, so that nothing there tells
-# how much is needed.
-HINTED = RELIABLE / 2
+# How reliable what they come back to must be, where normals are believed (``Observability.hint``). By hand: in made-up
+# pans over a blank wall (6 to 18 deg a frame), slides along one, corridors and tunnels all such poses were right, within
+# 0.04 voxels at hints above 0.35, 0.12 at 0; there were too few to tell where between the two a limit belongs.
+HINTED = 1 / 3
 ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
