@@ -18,7 +18,7 @@ REFERENCE = "reference_poses.txt"
 def turning():
     """Scans and poses of a drive through a bend at 40 deg/s, in motion from the first scan on; two of them at rest."""
     place, poses, rng = make_street(60), drive(60)[20:42], np.random.default_rng(2)
-    return [scan(place, pose, rng, columns=250) for pose in poses], poses
+    return [scan(place, pose, rng, columns=450) for pose in poses], poses
 
 
 def run(scans):
