@@ -8,6 +8,9 @@ WORKERS ?= auto # of pytest; a test process takes about 0.7 GB
 
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal # runs of tests: what a file's tests share is made once
 
+# Tests start many processes: what the first one compiles, the others read, even where the environment says otherwise.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo lint test test-all coverage docs clean
 
 demo: .venv/installed

@@ -41,9 +41,10 @@ from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.io import read_cloud
 from fmr_cli.registration.confidence import Judge
 from fmr_cli.registration.hypotheses import Hypothesis, from_features, from_search, from_solver
+from fmr_cli.registration.looks import FIRST, SURE, consider
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
-from fmr_cli.registration.pipeline import FIRST, SURE, align, consider, one_blas_thread
+from fmr_cli.registration.pipeline import align, one_blas_thread
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.refinement import refined
 from fmr_cli.registration.result import Stopwatch

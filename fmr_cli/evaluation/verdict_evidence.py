@@ -15,9 +15,10 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration.confidence import Judge
+from fmr_cli.registration.looks import FIRST, consider, features, further
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
-from fmr_cli.registration.pipeline import FIRST, consider, features, further, one_blas_thread
+from fmr_cli.registration.pipeline import one_blas_thread
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Stopwatch
 from fmr_cli.synthetic.calibration_pairs import calibration_pair

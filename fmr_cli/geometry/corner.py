@@ -11,7 +11,8 @@ import numpy as np
 PLANES = 3
 POINTS, SEEDS = 1000, 60  # points that are looked at, and those of them whose tangent planes are tried
 ALONG = 0.85  # |cosine| between a point's normal and its plane's: noise turns normals by 20 deg, 30 deg are a bend
-OFF = 1.5  # voxel edges that a point of a plane may lie off: beside an edge, voxels average both sides
+OFF = 1.5  # voxel edges that a point of a plane may lie off, and the least: beside an edge, voxels average both sides
+LEAST_OFF, SIGMAS = 0.5, 4.0  # between them, times the plane's own scatter: a window's recess is no noise of its wall
 ACROSS = 0.5  # of a normal, the least share outside the span of the former planes': parallel planes make no corner
 
 
@@ -30,11 +31,21 @@ def share_beyond_corner(points: np.ndarray, normals: np.ndarray, edge: float, rn
             break
         off = np.abs(x @ n[seeds].T - np.einsum("ni,ni->n", x[seeds], n[seeds]))
         along = (off < OFF * edge) & (np.abs(n @ n[seeds].T) > ALONG)
-        plane = x[along[:, along.sum(0).argmax()]]
-        middle = plane.mean(0)
-        normal = np.linalg.eigh((plane - middle).T @ (plane - middle))[1][:, 0]
-        left = np.abs((x - middle) @ normal) >= OFF * edge
-        x, n = x[left], n[left]
+        normal, on = plane(x, n, along[:, along.sum(0).argmax()], edge)
+        x, n = x[~on], n[~on]
         new = across @ normal
         across = across - np.outer(new, new) / max(float(new @ new), 1e-12)
     return len(x) / max(len(some), 1)
+
+
+def plane(points: np.ndarray, normals: np.ndarray, about: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
+    """The plane through points ``about`` (N,), as thick as its own points scatter: its normal (3,), what lies on it."""
+    for _ in range(2):  # the second time without what stands out from it
+        middle = points[about].mean(0)
+        normal = np.linalg.eigh((points[about] - middle).T @ (points[about] - middle))[1][:, 0]
+        off = np.abs((points - middle) @ normal)
+        alike = (off < OFF * edge) & (np.abs(normals @ normal) > ALONG)
+        sigma = 1.4826 * np.median(off[alike]) if alike.any() else 0.0  # of a normal distribution
+        on = off < np.clip(SIGMAS * sigma, LEAST_OFF * edge, OFF * edge)
+        about = alike & on if (alike & on).sum() >= PLANES else about
+    return normal, on

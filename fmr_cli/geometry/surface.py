@@ -44,6 +44,11 @@ class Surface:
         """(M,) which points have neighbours enough to be a piece of surface; others are dust or a LiDAR's rim."""
         return self._shape[2] < SPARSE * self.edge
 
+    @property
+    def lean(self) -> np.ndarray:
+        """(M,) how far off each point its neighbours' mean is, as a share of their reach: most at a border."""
+        return self._shape[3]
+
     @cached_property
     def unevenness(self) -> tuple[np.ndarray, np.ndarray]:
         """How far the nearest 3 lie off each point's tangent plane, own unit, and 1 - |cosine| of their normals: (M,).

@@ -46,13 +46,13 @@ def main_directions(normals: np.ndarray) -> np.ndarray | None:
     n = normals[:: max(len(normals) // NORMALS, 1)]
     R = rotations(STARTS)[:, :3, :3]
     for _ in range(STEPS):
-        along = np.einsum("ni,sij->snj", n, R)
+        along = n @ R  # (S, N, 3) by BLAS, which einsum would not use
         weight = np.where(np.abs(along) == np.abs(along).max(2, keepdims=True), along, 0.0)
         weight = np.where(np.abs(weight) > 0.8, np.sign(weight), 0.0)  # beyond 37 deg it belongs to none
-        U, _, Vt = np.linalg.svd(np.einsum("ni,snj->sij", n, weight))
+        U, _, Vt = np.linalg.svd(n.T @ weight)
         U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
         R = U @ Vt
-    share = (np.abs(np.einsum("ni,sij->snj", n, R)).max(2) > ALONG).mean(1)
+    share = (np.abs(n @ R).max(2) > ALONG).mean(1)
     best = int(share.argmax())
     return R[best] if share[best] >= MOST else None
 

@@ -3,7 +3,8 @@
 Only the common region speaks: a point that lies over a part of the other surface, not beyond its border. There it is
 explained if it lies on that surface and faces along with it, and contradicted if it floats above or below, or
 faces across: the other scan saw a surface here and not this one. So the border of a scan, which is where the sensor's
-view ends, says nothing. Distances count in voxel edges.
+view ends, says nothing; nor do normals of points whose neighbours' own differ, as along an edge. Distances count in
+voxel edges.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ TOUCHING = 1.5  # voxel edges: nearer points overlap, as voxels of one surface d
 OVER = 1.0  # voxel edges along the tangent plane, within which a point lies over a surface point
 CLEAR, UNEVEN = 0.5, 2.5  # voxel edges, and times the surface's own unevenness: an offset beyond both contradicts
 ACROSS = 0.4  # |cosine| between normals: from FACING on they agree, below this they contradict
+# Lean of a surface point (``normals_and_variation``) from which it may lie at a border, where the other scan goes on:
+# 0.42 at a straight border, 0.15 in the median and up to 0.3 within. A border's normals mix what ends there.
+AT_BORDER = 0.25
 STRETCH_POINTS = 1500  # of the source, on which a change of scale is tried
 STRETCH_REACH = 2.5  # voxel edges
 STRETCH_SIGMAS = 3.0  # deviations that chance may explain
@@ -71,7 +75,8 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
         clear = off > np.maximum(CLEAR, UNEVEN * np.maximum(own_off, a.unevenness[0][here] / a.edge))
         explained = over & ~clear & (cosine > FACING)
         touching = d < TOUCHING
-        contradicted = over & (clear | (touching & (cosine < ACROSS) & (own_turn < 1 - FACING)))
+        across = touching & (cosine < ACROSS) & (np.maximum(own_turn, a.unevenness[1][here]) < 1 - FACING)
+        contradicted = over & (b.lean[there] < AT_BORDER) & (clear | across)
         sums += [
             explained.sum(), contradicted.sum(), touching.sum(), (d[touching] ** 2).sum(), (off[touching] ** 2).sum(),
             (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),

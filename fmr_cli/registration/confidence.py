@@ -30,8 +30,8 @@ AS_GOOD = 1.5  # times as close as a surface's own neighbours: beyond, points ar
 # What no other evidence outweighs, and the confidence that it leaves at most; by the looks at 640 made-up pairs, bent
 # ones too (`python -m benchmarks.calibrate` counts them). Such pairs are too few for the weights to say so themselves.
 OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: none of 892 right poses had that
-DENIED = 0.1  # more contradicted than explained: 1 of 56 poses that stood first was right
-# Fewer points of detail than that, hardly more than a corner, which fits any other: 9 of 95 were right.
+DENIED = 0.1  # more contradicted than explained: none of 33 poses that stood first was right
+# Fewer points of detail than that, hardly more than a corner, which fits any other: 6 of 66 were right.
 BARE, IF_BARE = 5, 0.3
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
@@ -201,8 +201,9 @@ class Judge:
         self.weigh(self.candidates)
 
     def knows(self, T_target_source: np.ndarray) -> bool:
-        """Whether a candidate has that pose already."""
-        return any(self.pair.same(T_target_source, c.T_target_source) for c in self.candidates)
+        """Whether a candidate has that pose and fits as well there: what a refinement has spoilt may be tried again."""
+        near = [c.T_target_source for c in self.candidates if self.pair.same(T_target_source, c.T_target_source)]
+        return bool(near) and max(map(self.pair.overlap_score, near)) >= self.pair.overlap_score(T_target_source)
 
     def last_word(self, T_target_source: np.ndarray) -> str:
         """What is known of a pose, for the log."""

@@ -21,6 +21,7 @@ ELSEWHERE = 4.0  # voxel edges: a runner-up nearer to the match shows the same p
 RIVAL_SHARE = 0.08  # of the matches behind a pose that must have their like behind a rival
 RIVAL_MATCHES = 4  # at least: fewer agree by chance
 RIVAL_SCORE = 0.35  # of the pose's own overlap score, that a rival has at least
+HALF_TURNED = 0.7  # likewise, of a half-turn: an object's that is symmetric has all of it, flat ground half and more
 RIVALS = 12  # at most: of a longer row, the nearest
 ORBIT = 24  # poses tried along what maps a cloud onto itself: a gear's turns, both ways along a facade
 
@@ -88,19 +89,28 @@ def rivals(pair: Pair, T_target_source: np.ndarray) -> tuple[list[Hypothesis], f
     The matches behind the pose have runners-up: other places that look alike. What pose these agree on, T', differs
     from T by a motion S = T' T^-1 that maps the target (or, S' = T^-1 T', the source) onto itself: a period of a
     facade, a turn of a gear. Where there is one there are its powers, S S T and S^-1 T, and its products with others.
+    What has too few features to say so may still be symmetric about an axis of its own: half-turns are tried as well.
     """
-    x, y = runners_up(pair, T_target_source)
-    if len(x) < RIVAL_MATCHES:
-        return [], 0.0
-    poses, counts = agreed(pair, x, y)
     behind = max(pair.inlier_count(T_target_source), 1)
-    least = max(RIVAL_MATCHES, RIVAL_SHARE * behind)
     back = np.linalg.inv(T_target_source)
-    generators = [T @ back for T, count in zip(poses, counts, strict=True) if count >= least]
-    generators += [np.linalg.inv(S) for S in generators]
+    score = pair.overlap_score(T_target_source)
+    turns = [*half_turns(pair.t.points), *(T_target_source @ S @ back for S in half_turns(pair.s.points))]
+    generators = [S for S in turns if pair.overlap_score(S @ T_target_source) >= HALF_TURNED * score]
+    x, y = runners_up(pair, T_target_source)
+    repeats = 0.0
+    if len(x) >= RIVAL_MATCHES:
+        poses, counts = agreed(pair, x, y)
+        least = max(RIVAL_MATCHES, RIVAL_SHARE * behind)
+        steps = [T @ back for T, count in zip(poses, counts, strict=True) if count >= least]
+        generators += [*steps, *(np.linalg.inv(S) for S in steps)]
+        repeats = min(float(counts.max(initial=0)) / behind, 1.0)
+    return orbit(pair, T_target_source, generators, RIVAL_SCORE * score), repeats
+
+
+def orbit(pair: Pair, T_target_source: np.ndarray, generators: list[np.ndarray], floor: float) -> list[Hypothesis]:
+    """The poses S T, S S' T, ... of motions S (4, 4) of the target that score at least ``floor``, the nearest first."""
     found: list[Hypothesis] = []
     tried = [T_target_source]
-    floor = RIVAL_SCORE * pair.overlap_score(T_target_source)
     queue = [S @ T_target_source for S in generators]
     while queue and len(tried) <= ORBIT and len(found) < RIVALS:
         T = queue.pop(0)
@@ -111,7 +121,19 @@ def rivals(pair: Pair, T_target_source: np.ndarray) -> tuple[list[Hypothesis], f
         if score >= floor and pair.allowed(T):
             found.append(Hypothesis(T, "rival", score))
             queue += [S @ T for S in generators]
-    return found, min(float(counts.max(initial=0)) / behind, 1.0)
+    return found
+
+
+def half_turns(points: np.ndarray) -> list[np.ndarray]:
+    """The half-turns (4, 4) about a cloud's principal axes, of which a symmetric thing has some: a table, a box."""
+    middle = points.mean(0)
+    found = []
+    for axis in np.linalg.eigh((points - middle).T @ (points - middle))[1].T:
+        S = np.eye(4)
+        S[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
+        S[:3, 3] = middle - S[:3, :3] @ middle
+        found.append(S)
+    return found
 
 
 def runners_up(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

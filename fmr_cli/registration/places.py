@@ -7,18 +7,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
+from fmr_cli.cloud import transform_points
+from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.sampling import WITHIN
+from fmr_cli.registration.confidence import ALIGNED, Judge
+from fmr_cli.registration.hypotheses import Hypothesis
+from fmr_cli.registration.looks import FIRST, SURE, consider, features, further
 from fmr_cli.registration.options import Options
+from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import MIN_POINTS, Prepared
+from fmr_cli.registration.result import Stopwatch
 
 FROM = 2.5  # times the source's reach, from which the target is taken for a map: below, one look at all of it is enough
 WIDTH, STEP = 3.0, 1.5  # of a part, and from one to the next, in reaches: some part holds nearly all that a scan saw
 MOST_PARTS = 400  # a reach that gives more is hardly that of a scan in a map: a tea cup and a street
 FEWEST = 20 * MIN_POINTS  # points of a part that is worth a look
+PLACES, APART = 4, 10.0  # whose poses are judged, and voxel edges that they lie apart
+CLOSER = 2  # of them that are looked at closer, the second one where the first one was not the place
 
 
 def is_map(source: Prepared, target: Prepared, options: Options) -> bool:
@@ -45,3 +56,44 @@ def parts(source: Prepared, target: Prepared, options: Options) -> Iterator[Prep
         inside = (np.abs(target.points - centre) <= WIDTH / 2 * size).all(1)
         if inside.sum() >= FEWEST:
             yield target.part(inside)
+
+
+def look(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge | None:
+    """What is found in the parts of a map where a glance finds most; None where it has no such parts.
+
+    The poses of different places exclude each other: the best one shares its confidence with what else looks right.
+    """
+    glances: list[tuple[Pair, list[Hypothesis]]] = []
+    for part in parts(source, target, options):
+        with suppress(RegistrationError):
+            pair = make_pair(source, part, options, threads, *FIRST)
+            found = [h for h in features(pair, time) if pair.allowed(h.T_target_source)]
+            if found:
+                glances.append((pair, sorted(found, key=lambda h: -h.score)))
+    looked: list[np.ndarray] = []  # where the source's centre came to lie
+    judges: list[Judge] = []
+    for pair, found in sorted(glances, key=lambda glance: -glance[1][0].score):
+        at = transform_points(pair.leave_centred(found[0].T_target_source), source.centre[None])
+        if len(judges) < PLACES and all(np.linalg.norm(at - other) > APART * pair.edge for other in looked):
+            looked.append(at)
+            judges.append(Judge(pair))
+            consider(judges[-1], found, time)
+    judges = sorted((j for j in judges if j.candidates), key=lambda j: -j.best.confidence)
+    for number, judge in enumerate(judges[:CLOSER]):
+        if not judge.sure(SURE):
+            judges[number] = further(source, judge.pair.target, options, threads, time)
+        if judges[number].sure(ALIGNED):
+            break
+    if not judges:
+        return None
+    judge, *others = sorted(judges, key=lambda j: -j.best.confidence)
+    pair, best = judge.pair, judge.best
+    elsewhere = [
+        replace(j.best, T_target_source=pair.enter_centred(j.pair.leave_centred(j.best.T_target_source)))
+        for j in others
+    ]
+    elsewhere = [c for c in elsewhere if not pair.same(c.T_target_source, best.T_target_source)]
+    # At most one of them is right, or none: each weighs its odds against "none", as if it were alone.
+    odds = [c.confidence / max(1 - c.confidence, 1e-12) for c in (best, *elsewhere)]
+    judge.candidates = [replace(best, confidence=odds[0] / (1 + sum(odds))), *elsewhere, *judge.candidates[1:]]
+    return judge

@@ -23,9 +23,9 @@ from fmr_cli.io.weights import weights_bytes
 from fmr_cli.multiway.store import Store
 from fmr_cli.registration import Options, align, prepare
 from fmr_cli.registration.confidence import ALIGNED, SURE_LOGIT
+from fmr_cli.registration.looks import FURTHER
 from fmr_cli.registration.models import model
 from fmr_cli.registration.pair import make_pair
-from fmr_cli.registration.pipeline import FURTHER
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.verdict_weights import Weights
 from fmr_cli.training.scan_views import Overlapping

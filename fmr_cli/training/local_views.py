@@ -60,6 +60,10 @@ class Views:
         moved: dict[str, Any] = {n: v.to(device) for n, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **moved | {name: moved[name].float() for name in ("source", "target")})
 
+    def sparser(self, points: Tensor) -> Views:
+        """With so many of each patch's points alone, by their numbers."""
+        return replace(self, source=self.source[:, points], target=self.target[:, points])
+
     def half(self) -> Views:
         """Patches as float16, which takes half the memory and is exact to a thousandth of a patch."""
         return replace(self, source=self.source.half(), target=self.target.half())

@@ -160,10 +160,12 @@ class ScanRecipe:
     made_up: int = 96  # pairs of procedural scans, so that nothing is forgotten
     patches: int = 96  # of one place, of each scan of a pair, at most
     others: int = 48  # of each scan's patches that are in it alone
+    patch_points: int = 32  # of a patch's 64, drawn anew in each step: two fifths of the time, and another sampling
     batch: int = 2  # pairs of a step
     temperature: float = 0.07  # of InfoNCE
     apart: float = 3.0  # voxel edges: nearer places are not each other's negatives
-    learning_rate: float = 5e-4  # twice as much gains a little more on the scans and forgets three times as much
+    learning_rate: float = 2e-3  # a minute has some hundred steps
+    stays: float = 0.4  # share of the start's weights in the mean that is kept, so that little is forgotten
     whole_every: int = 5  # one step in so many is the global encoder's; 0 leaves it as it is
     steps: int = 1200
     epoch_steps: int = 100
@@ -174,12 +176,13 @@ class ScanRecipe:
     whole: Recipe = field(default_factory=lambda: Recipe(crops=1024, decoder_warmup=100, held_out_pairs=12))
 
     def __post_init__(self) -> None:
+        counts = "rounds", "scans", "patches", "patch_points", "batch", "steps", "epoch_steps", "tested"
         for name, value in vars(self).items():
-            least = 1 if name in ("rounds", "scans", "patches", "batch", "steps", "epoch_steps", "tested") else 0
+            least = 1 if name in counts else 0
             if isinstance(value, int | float) and not value >= least:
                 raise RecipeError(f"the recipe has {name} = {value}; give a larger number")
-        if not 0 < self.held_out < 1 or not self.temperature > 0:
-            raise RecipeError("the recipe needs held_out between 0 and 1, and a temperature above 0")
+        if not 0 < self.held_out < 1 or not self.temperature > 0 or not self.stays < 1:
+            raise RecipeError("the recipe needs held_out between 0 and 1, stays below 1, and a temperature above 0")
         if self.scans < 2:
             raise RecipeError("the recipe has scans = 1; give two or more")
         if not self.pairs + self.single + self.made_up:
@@ -197,13 +200,12 @@ class ScanRecipe:
         return replace(
             self,
             rounds=1 if minutes < 3 else 2 if minutes < 8 else 3,
-            scans=16 if minutes < 3 else 40,
+            scans=_between(10 * minutes**0.5, 10, 40),  # a round then takes a fifth of the time or so on two cores
             pairs=_between(40 * minutes, 40, 240),
             single=_between(12 * minutes, 12, 64),
-            made_up=_between(16 * minutes, 16, 96),
+            made_up=_between(20 * minutes, 20, 96),
             tested=8 if minutes < 3 else 12,
             checked=_between(12 * minutes, 12, 60),
-            epoch_steps=50 if minutes < 3 else 100,
             whole_every=0 if minutes < 3 else self.whole_every,
         )
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from fmr_cli.descriptors.patch_encoder import PATCH_POINTS, LocalEncoder
 from fmr_cli.errors import ModelError
 from fmr_cli.io.weights import Weights, weights_bytes
 from fmr_cli.multiway.scans import Scan
@@ -53,8 +54,10 @@ class ScanTask(Task):
         self.clouds, self.clip = 2 * recipe.batch, recipe.whole.clip
         torch.manual_seed(recipe.seed)
         self.net = LocalNet().to(device)
+        self.first: dict[str, Tensor] = {}
         if recipe.start != "scratch":
-            self.net.load_state_dict(local_start(start))
+            self.first = local_start(start)
+            self.net.load_state_dict(self.first)
         self.modules: dict[str, nn.Module] = {"local": self.net, **(whole.modules if whole else {})}
         self.material = ScanMaterial(recipe, scans, labelled or [])
         self.described = [*self.material.described(), *(whole.described if whole else [])]
@@ -71,8 +74,17 @@ class ScanTask(Task):
         """A file of what has been learnt so far; in the first round, what the run starts from."""
         if number == 0:
             return self.start
-        files.write(CURRENT, weights_bytes(Weights(local=arrays(self.net.state_dict()))))
+        files.write(CURRENT, weights_bytes(Weights(local=self.learnt())))
         return files.path / CURRENT
+
+    def learnt(self) -> dict[str, np.ndarray]:
+        """The local encoder as it is tested and kept: between what it started from and where the steps have led.
+
+        A mean of both weights keeps most of what is new and forgets little (Wortsman et al., CVPR 2022, "WiSE-FT").
+        """
+        now, new = arrays(self.net.state_dict()), np.float32(1 - self.recipe.stays)
+        first = {name: value.numpy() for name, value in self.first.items()}
+        return {name: first[name] + new * (now[name] - first[name]) for name in first} or now
 
     # Steps.
 
@@ -93,7 +105,8 @@ class ScanTask(Task):
         for kind in kinds.tolist():
             views = list(there.values())[kind]
             which = torch.randint(len(views), (1,), generator=generator, device=self.device)
-            chosen.append(views[int(which)].to(self.device))
+            seen = torch.randperm(PATCH_POINTS, generator=generator, device=self.device)[: recipe.patch_points]
+            chosen.append(views[int(which)].sparser(seen.cpu()).to(self.device))
         pairs = zip(described(self.net, chosen), chosen, strict=True)
         each = [info_nce(a, b, v, recipe.temperature, recipe.apart) for (a, b), v in pairs]
         return {"info_nce": torch.stack(each).mean()}
@@ -110,12 +123,11 @@ class ScanTask(Task):
     @torch.no_grad()
     def test(self) -> Scores:
         """How many matches are right, of held-out scans and of made-up ones; the global encoder's own test."""
-        scores = {}
+        scores, encoder = {}, LocalEncoder.of(self.learnt())  # as ``align`` has it, and faster
         for name, views in self.material.tests.items():
-            shares = []
-            for v in views:
-                [(a, b)] = described(self.net, [v.to(self.device)])
-                shares.append(inlier_ratio(a.cpu().numpy(), b.cpu().numpy(), v))
+            shares = [
+                inlier_ratio(encoder(v.source.float().numpy()), encoder(v.target.float().numpy()), v) for v in views
+            ]
             if shares:
                 scores[name] = {RIGHT: float(np.mean(shares))}
         if self.whole is not None:
@@ -135,7 +147,7 @@ class ScanTask(Task):
     def weights(self) -> bytes:
         """The model file: both encoders, the global one as it was where it has got worse."""
         started = model(self.start).weights
-        local = arrays(self.net.state_dict())
+        local = self.learnt()
         if self.whole is None or not self.whole_is_better():
             return weights_bytes(Weights(**vars(started) | {"local": local, "decoder": started.decoder}))
         encoder, decoder = self.whole.encoder, self.whole.decoder

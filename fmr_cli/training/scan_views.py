@@ -53,9 +53,9 @@ def drawn_views(
     T = pair.T_target_source
     if rng.random() < 0.5:
         clouds, T = clouds[::-1], np.linalg.inv(T)
-    edge = pair.edge * rng.choice(SCALES) * np.exp(rng.normal(0, JITTER))
     spacing = max(working_scale(points, rng)[1] for points in clouds)
-    source, target = (Surface(points, max(edge, SPACINGS * spacing)) for points in clouds)
+    edge = max(pair.edge, SPACINGS * spacing) * rng.choice(SCALES) * np.exp(rng.normal(0, JITTER))
+    source, target = (Surface(points, edge) for points in clouds)
     return between(source, target, T, rng, count, others)
 
 

@@ -78,6 +78,14 @@ class Found:
     said: str
     skipped: list[str]
 
+    def joined(self) -> bool:
+        """Whether the pairs join all the scans into one part: there is no other place for any of them."""
+        reached, front = set[int](), set(self.scans[:1])
+        while front:
+            reached |= front
+            front = {n for pair in self.pairs for n in pair.ends if front & set(pair.ends)} - reached
+        return len(reached) == len(self.scans)
+
     def plain(self) -> dict[str, Any]:
         return asdict(self)
 

@@ -23,13 +23,21 @@ class CutError(Exception):
     """Stands for whatever ends a process."""
 
 
-@pytest.fixture
-def manifest(tmp_path):
+@pytest.fixture(scope="module")
+def manifest(tmp_path_factory):
     """Four pairs, of which the second has no target."""
     a, b = SAMPLES / "scan_a.ply", SAMPLES / "scan_b.ply"
-    path = tmp_path / "pairs.csv"
+    path = tmp_path_factory.mktemp("batch") / "pairs.csv"
     path.write_text(f"source,target\n{a},{b}\n{a},nowhere.ply\n{b},{a}\n{b},{b}\n")
     return path
+
+
+@pytest.fixture(scope="module")
+def whole(manifest, tmp_path_factory):
+    """A whole run: its folder, its rows, and what it told."""
+    out, told = tmp_path_factory.mktemp("whole"), []
+    rows = align_batch(manifest, out, workers=1, on_row=lambda row, done, total: told.append((row, done, total)))
+    return out, rows, told
 
 
 def table(out):
@@ -37,15 +45,12 @@ def table(out):
         return list(csv.DictReader(file))
 
 
-def test_it_returns_the_rows_of_its_file_and_tells_each(manifest, tmp_path):
-    told = []
-    rows = align_batch(
-        manifest, tmp_path / "out", on_row=lambda row, done, total: told.append((row["status"], done, total))
-    )
-    assert rows == table(tmp_path / "out")
-    assert told == [(row["status"], number, 4) for number, row in enumerate(rows, 1)]
+def test_it_returns_the_rows_of_its_file_and_tells_each(whole):
+    out, rows, told = whole
+    assert rows == table(out)
+    assert told == [(row, number, 4) for number, row in enumerate(rows, 1)]
     assert [row["status"] == "failed" for row in rows] == [False, True, False, False]
-    assert not (tmp_path / "out" / "aligned").exists()
+    assert not (out / "aligned").exists()
 
 
 def test_cut_off_and_gone_on_with_it_keeps_the_rows_it_has(manifest, tmp_path):
@@ -54,7 +59,7 @@ def test_cut_off_and_gone_on_with_it_keeps_the_rows_it_has(manifest, tmp_path):
             raise CutError
 
     with pytest.raises(CutError):
-        align_batch(manifest, tmp_path / "out", on_row=cut)
+        align_batch(manifest, tmp_path / "out", workers=1, on_row=cut)
     before = table(tmp_path / "out")
     assert len(before) == 2
     with pytest.raises(CloudFileError, match="is there already"):
@@ -64,7 +69,11 @@ def test_cut_off_and_gone_on_with_it_keeps_the_rows_it_has(manifest, tmp_path):
     half = tmp_path / "out" / "transforms" / f".scan_b_scan_a.{host()}-{killed.pid}-01234567.tmp.txt"
     half.write_text("1 0")
     told = []
-    rows = align_batch(manifest, tmp_path / "out", resume=True, on_row=lambda row, done, total: told.append(done))
+
+    def on_row(row, done, total):
+        told.append(done)
+
+    rows = align_batch(manifest, tmp_path / "out", workers=1, resume=True, on_row=on_row)
     assert not half.exists()
     assert told == [3, 4]
     assert rows[:2] == before
@@ -92,12 +101,12 @@ def test_pairs_that_share_files_go_to_one_worker_and_spent_files_are_let_go_of(t
     assert [len(block.pairs) for block in pipeline.in_blocks(runner, pairs, most=4, sharing=False)] == [4, 2]
 
 
-def test_the_metrics_of_each_pair_are_those_of_align(manifest, tmp_path):
-    align_batch(manifest, tmp_path / "out")
-    found = sorted(path.stem for path in (tmp_path / "out" / "metrics").iterdir())
-    assert found == sorted(path.stem for path in (tmp_path / "out" / "transforms").iterdir())
+def test_the_metrics_of_each_pair_are_those_of_align(whole):
+    out, _, _ = whole
+    found = sorted(path.stem for path in (out / "metrics").iterdir())
+    assert found == sorted(path.stem for path in (out / "transforms").iterdir())
     assert len(found) == 3
-    metrics = json.loads((tmp_path / "out" / "metrics" / f"{found[0]}.json").read_text())
+    metrics = json.loads((out / "metrics" / f"{found[0]}.json").read_text())
     a, b = (read_cloud(SAMPLES / f"scan_{name}.ply") for name in "ab")
     expected = export.metrics(a, b, align(a, b))
     assert {**metrics, "seconds": 0} == {**json.loads(json.dumps(expected)), "seconds": 0}

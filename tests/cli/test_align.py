@@ -92,8 +92,8 @@ def test_a_start_from_a_file(run, fmr, tmp_path, samples, truth, pose_error):
 
 def test_scans_of_different_things_are_uncertain_and_still_written(fmr, samples, tmp_path):
     rng = np.random.default_rng(0)
-    ball = rng.normal(size=(4000, 3))
-    write_cloud(tmp_path / "ball.ply", PointCloud(ball / np.linalg.norm(ball, axis=1, keepdims=True)))
+    ball = rng.normal(size=(2000, 3))  # of the scan's size: a smaller one would be sought all over it
+    write_cloud(tmp_path / "ball.ply", PointCloud(4 * ball / np.linalg.norm(ball, axis=1, keepdims=True)))
     done = fmr("align", "ball.ply", samples / "scan_b.ply", "-o", "T.txt", cwd=tmp_path)
     assert done.returncode == 3
     assert done.stderr.startswith("uncertain")

@@ -28,11 +28,11 @@ COUNTS = {
 
 
 @pytest.fixture(scope="module")
-def said(shared_data: Path, fmr_process: Fmr) -> dict[str, dict]:
-    """What one run of the command says about every real scan, by the file's name."""
-    scans = sorted([*shared_data.glob("hdl64/*.pcd"), *shared_data.glob("kitti_raw/*.bin")])
+def said(shared_data: Path, fmr: Fmr) -> dict[str, dict]:
+    """What one run of the command says about real scans, by the file's name."""
+    scans = sorted([*shared_data.glob("hdl64/*.pcd"), *shared_data.glob("kitti_raw/*.bin")])[::4]
     files = [*COUNTS, *(str(path.relative_to(shared_data)) for path in scans)]
-    done = fmr_process("info", *files, "--json", cwd=shared_data)
+    done = fmr("info", *files, "--json", cwd=shared_data)
     assert (done.returncode, done.stderr) == (0, "")
     return {entry["file"]: entry for entry in json.loads(done.stdout)}
 
@@ -40,7 +40,7 @@ def said(shared_data: Path, fmr_process: Fmr) -> dict[str, dict]:
 def test_every_real_file_has_the_right_count(said: dict[str, dict], shared_data: Path) -> None:
     assert {name: said[name]["points"] for name in COUNTS} == COUNTS
     scans = [name for name in said if name not in COUNTS]
-    assert len(scans) == 27
+    assert len(scans) == 7
     for name in scans:
         data = (shared_data / name).read_bytes()
         match = re.search(rb"POINTS (\d+)", data[:400])

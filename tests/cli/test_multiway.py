@@ -20,7 +20,7 @@ from fmr_cli import PointCloud, read_cloud, write_cloud
 
 @pytest.fixture(scope="module")
 def clouds():
-    return room_views(3, 4)
+    return room_views(3, 4, 5_000)
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +45,11 @@ RUN = ("multiway", "scans", "--aligned", "--anchor", "s2", "--merged", "all.ply"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, fmr_process, scans):
-    """One run that several tests look at: (its folder, the process)."""
+def run(tmp_path_factory, fmr, scans):
+    """One run that several tests look at: (its folder, what it said)."""
     folder = tmp_path_factory.mktemp("run")
     shutil.copytree(scans / "scans", folder / "scans")
-    return folder, fmr_process(*RUN, cwd=folder)
+    return folder, fmr(*RUN, cwd=folder)
 
 
 def table(path):

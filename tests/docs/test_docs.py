@@ -34,6 +34,7 @@ WITH_EXAMPLES = [page for page in SHOWN if examples.examples(page.read_text("utf
 FIRST = "README.md"  # its examples run with the quick tests, those of the other pages take minutes
 
 
+@pytest.mark.slow
 def test_it_builds_and_every_link_and_anchor_leads_somewhere(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="pip install '.[docs]'")
     done = subprocess.run(

@@ -11,8 +11,8 @@ from fmr_cli import PointCloud
 
 @pytest.fixture(scope="session")
 def room():
-    """Six scans of a room that go round it, and their T_world_scan."""
-    return room_views(3, 6)
+    """Four scans of a room that go round it, and their T_world_scan."""
+    return room_views(3, 4)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from fmr_cli.multiway.known import Known, KnownLink, KnownPose
 
 
 def test_every_scan_is_placed_where_it_belongs(network, room, worst_error):
-    assert [scan.component for scan in network.scans] == [0] * 6
+    assert [scan.component for scan in network.scans] == [0] * 4
     assert network.whole
     rot, shift = worst_error([scan.T_component_scan for scan in network.scans], room[1])
     assert rot < 0.3
@@ -21,13 +21,6 @@ def test_every_scan_is_placed_where_it_belongs(network, room, worst_error):
     assert anchor.sigma_shift == 0
     assert all(0 < scan.sigma_shift < 0.02 for scan in network.scans if scan is not anchor)
     assert all(0 < scan.residual < 0.02 for scan in network.scans)
-
-
-def test_the_joint_refinement_beats_the_graph_alone(network, room, worst_error):
-    graph = worst_error([scan.T_component_scan_graph for scan in network.scans], room[1])
-    refined = worst_error([scan.T_component_scan for scan in network.scans], room[1])
-    assert refined[0] < graph[0]
-    assert refined[1] < graph[1]
 
 
 def test_links_that_hold_agree_with_the_truth(network, room):
@@ -54,14 +47,10 @@ def test_the_same_bits_with_one_worker(network, room):
 
 @pytest.mark.slow
 def test_scans_of_two_places_are_two_components(room):
-    others, _ = room_views(21, 3)
-    mixed = [*others[:2], *room[0][:3], others[2]]
-    found = align_many([PointCloud(points) for points in mixed], workers=2)
-    places = [{n for n in members if n in (0, 1, 5)} for members in found.components]
-    for members, here in zip(found.components, places, strict=True):
-        assert not here or here == set(members), "a component holds scans of one place alone"
+    (first, second), _ = room_views(21, 2)
+    found = align_many([PointCloud(points) for points in (first, *room[0][:2], second)], workers=2)
+    assert sorted(map(sorted, found.components)) == [[0, 3], [1, 2]], "a component holds scans of one place alone"
     assert not found.whole
-    assert len(found.components) >= 1
 
 
 def known_links(network, names, wrong=()):
@@ -83,7 +72,7 @@ def known_links(network, names, wrong=()):
 @pytest.mark.slow
 def test_a_wrong_link_does_no_harm_and_is_named(network, room, worst_error):
     names = [scan.name for scan in network.scans]
-    tie = {n: sum(n in x.ends for x in network.links if x.status == "aligned") for n in range(6)}
+    tie = {n: sum(n in x.ends for x in network.links if x.status == "aligned") for n in range(4)}
     bad = max((x for x in network.links if x.status == "aligned"), key=lambda x: min(tie[x.source], tie[x.target]))
     ends = (names[bad.source], names[bad.target])
     known = Known(links=known_links(network, names, wrong=[ends]))
@@ -100,7 +89,7 @@ def test_a_wrong_link_does_no_harm_and_is_named(network, room, worst_error):
 def test_fixed_scans_stay_and_the_others_come_into_their_frame(room, worst_error):
     clouds, truth = room
     poses = {"cloud_001": KnownPose(truth[1])}
-    found = align_many([PointCloud(x) for x in clouds[:4]], known=Known(poses=poses, fixed=["cloud_001"]), workers=2)
+    found = align_many([PointCloud(x) for x in clouds], known=Known(poses=poses, fixed=["cloud_001"]), workers=2)
     assert np.allclose(found.scans[1].T_component_scan, truth[1], atol=1e-9)
     for n in (0, 2, 3):
         assert np.allclose(found.scans[n].T_component_scan[:3, 3], truth[n][:3, 3], atol=0.05)
@@ -147,7 +136,7 @@ def test_a_bound_on_the_shift_keeps_scans_apart(room):
 @pytest.mark.slow
 def test_levelled_scans_stay_level(room):
     clouds, truth = room
-    level = [x @ T[:3, :3].T + [3.0 * n, 0, 0] for n, (x, T) in enumerate(zip(clouds[:4], truth, strict=False))]
+    level = [x @ T[:3, :3].T + [3.0 * n, 0, 0] for n, (x, T) in enumerate(zip(clouds, truth, strict=True))]
     found = align_many([PointCloud(x) for x in level], Options(dof="yaw"), workers=2)
     assert found.whole
     for scan in found.scans:

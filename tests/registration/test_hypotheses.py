@@ -6,6 +6,7 @@ import numpy as np
 
 from fmr_cli import PointCloud
 from fmr_cli.cloud import angle_degrees
+from fmr_cli.registration.confidence import Judge
 from fmr_cli.registration.hypotheses import rivals
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
@@ -30,3 +31,34 @@ def test_half_a_turn_is_found_as_a_rival_of_the_true_pose() -> None:
     assert repeats > 0.3
     turned = [angle_degrees(h.T_target_source) for h in found]
     assert any(abs(angle - 180) < 10 for angle in turned)
+
+
+def test_a_half_turn_is_found_where_features_do_not_tell_of_it() -> None:
+    """An egg of three axes: smooth, so that no features of its two halves are alike by more than chance."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(12_000, 3))
+    points *= np.array([1.0, 0.7, 0.45]) / np.linalg.norm(points, axis=1, keepdims=True)
+    pair = make_pair(Prepared(PointCloud(points[::2])), Prepared(PointCloud(points[1::2])), Options())
+    found = rivals(pair, pair.enter_centred(np.eye(4)))[0]
+    for axis in np.eye(3):
+        turned = [h for h in found if angle_degrees(h.T_target_source @ half_turn(axis)) < 10]
+        assert max(h.score for h in turned) > 0.9 * pair.overlap_score(np.eye(4))
+
+
+def half_turn(axis: np.ndarray) -> np.ndarray:
+    """(4, 4), about an axis (3,) of length 1 through the origin."""
+    T = np.eye(4)
+    T[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
+    return T
+
+
+def test_a_pose_that_a_refinement_has_spoilt_is_not_known() -> None:
+    points = box_like()
+    pair = make_pair(Prepared(PointCloud(points[::2])), Prepared(PointCloud(points[1::2])), Options())
+    judge, truth, beside = Judge(pair), pair.enter_centred(np.eye(4)), np.eye(4)
+    beside[:3, 3] = 2 * pair.edge
+    judge.consider(beside @ truth, "features", [])
+    assert not judge.knows(truth)
+    judge.consider(truth, "features", [])
+    assert judge.knows(beside @ truth)
+    assert len(judge.candidates) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,9 @@ from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import CloudFileError, OptionsError, RegistrationError
 from fmr_cli.io import read_transform, write_transform
 from fmr_cli.io.transforms import as_transform
-from fmr_cli.registration import Options, align
+from fmr_cli.registration import Options, align, mirror
 from fmr_cli.registration.mirror import MIRROR
-from fmr_cli.registration.pipeline import mirror_fits
+from fmr_cli.registration.pipeline import mirror_look
 from fmr_cli.registration.units import factor_of
 from fmr_cli.vectors import turn_vectors
 
@@ -29,7 +30,7 @@ def test_a_mirrored_scan_is_found_on_request_only(tmp_path: Path, clouds: tuple[
     plain = align(source, target)
     assert plain.status != "aligned"
     assert any("the mirror image of the source fits" in said for said in plain.warnings)
-    assert mirror_fits(PointCloud(points), target, Options()) is None
+    assert mirror_look(PointCloud(points), target, Options()) is None
     found = align(source, target, Options(allow_mirror=True))
     assert (found.status, found.mirrored) == ("aligned", True)
     assert np.linalg.det(found.T_target_source[:3, :3]) == pytest.approx(-1)
@@ -38,6 +39,24 @@ def test_a_mirrored_scan_is_found_on_request_only(tmp_path: Path, clouds: tuple[
     assert np.array_equal(read_transform(tmp_path / "T.txt", mirror=True), found.T_target_source)
     with pytest.raises(CloudFileError, match="would shear or mirror"):
         read_transform(tmp_path / "T.txt")
+
+
+def test_where_the_mirror_image_fits_better_a_pose_is_not_believed(clouds: tuple[np.ndarray, PointCloud]) -> None:
+    points, target = clouds
+    right = align(PointCloud(points), target)
+    image = mirror_look(PointCloud(points * [1, -1, 1]), target, Options())
+    assert right.status == "aligned"
+    assert mirror.unlikely(right)
+    assert image is not None
+    part = replace(
+        right, evidence=right.evidence | {"explained_share": 0.2, "contradicted": right.evidence["explained"]}
+    )
+    assert not mirror.unlikely(part)
+    doubted = mirror.weighed(part, image)
+    assert doubted.status == "uncertain"
+    assert doubted.confidence < 0.7
+    assert "the mirror image of the source fits better" in doubted.reasons[0]
+    assert mirror.weighed(replace(right, evidence=right.evidence | {"explained_share": 1.0}), image).status == "aligned"
 
 
 def test_a_mirror_moves_vectors_and_keeps_lengths() -> None:

@@ -123,6 +123,40 @@ def test_scans_that_share_nothing_and_broken_files_are_said(tmp_path, files):
     assert "broken.ply" in found.skipped[0]
 
 
+def test_scans_that_are_all_in_one_part_are_not_registered_again(files, found):
+    assert found.joined()
+    apart = replace(found, scans=[*found.scans, 9])
+    assert not apart.joined()
+    assert not replace(found, pairs=[]).joined()
+
+
+def facade(rng: np.random.Generator, start: float, bay: float = 2.0, length: float = 12.0) -> np.ndarray:
+    """A scan (n, 3) of a wall with a window in each bay, from ``start`` on; neither end of it is in sight."""
+    x, y = start + rng.uniform(0, length, 9000), rng.uniform(0, 3, 9000)
+    window = (np.abs(x % bay - bay / 2) < 0.5) & (np.abs(y - 1.6) < 0.7)
+    return np.column_stack([x, y, np.where(window, 0.3, 0.0)]) + rng.normal(0, 0.004, (9000, 3))
+
+
+def sphere(rng: np.random.Generator, start: float) -> np.ndarray:
+    """A scan (n, 3) of a ball, which looks the same from everywhere."""
+    d = rng.normal(size=(6000, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True) + rng.normal(0, 0.004, d.shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("surface", [facade, sphere])
+def test_of_scans_that_are_all_alike_no_alias_is_taken_for_the_truth(tmp_path, surface):
+    rng, scans = np.random.default_rng(0), []
+    for k in range(3):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+        write_cloud(tmp_path / f"{k}.ply", PointCloud(transform_points(T, surface(rng, 4.3 * k))))
+        scans.append(Scan(str(k), tmp_path / f"{k}.ply"))
+    found = register_scans(scans, list(range(3)), None, 12, 0)
+    assert found.pairs == []
+    assert "learning from single scans alone" in found.said
+
+
 def test_of_ten_thousand_scans_some_rows_are_drawn():
     rng = np.random.default_rng(0)
     some = drawn(10_000, 40, rng)
@@ -244,6 +278,19 @@ def test_one_scan_alone_learns_from_its_parts(tmp_path, files):
     assert "one scan" in notes[0]
     assert task.material.views["single"]
     assert task.material.tests["held-out scans"]
+
+
+def test_what_is_kept_lies_between_the_start_and_what_the_steps_have_led_to(files):
+    task = ScanTask(replace(TINY, stays=0.25), files[0], CPU, None, None)
+    first = {name: value.clone() for name, value in task.net.state_dict().items()}
+    assert all(np.array_equal(value, first[name]) for name, value in task.learnt().items())  # bit for bit
+    with torch.no_grad():
+        for value in task.net.parameters():
+            value += 1.0
+    for name, value in task.learnt().items():
+        np.testing.assert_allclose(value, first[name].numpy() + 0.75, rtol=1e-6, atol=1e-6)
+    scratch = ScanTask(replace(TINY, start="scratch"), files[0], CPU, None, None)
+    assert all(np.array_equal(value, scratch.net.state_dict()[name]) for name, value in scratch.learnt().items())
 
 
 def test_forgetting_counts_as_no_gain(files):
