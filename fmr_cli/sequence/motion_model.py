@@ -59,11 +59,12 @@ class MotionModel:
     """The last pose T_map_scan, the motion to it T_last_next, and the covariance (12, 12) of (pose, motion).
 
     radius: what turns radians into displacement, of the first scan's points about its sensor. begun: whether there has
-    been a motion.
+    been a motion; observed: whether the last pose was, in all directions.
     """
 
     def __init__(self, T_map_scan: np.ndarray, radius: float) -> None:
         self.T_map_scan, self.T_last_next, self.begun = T_map_scan, np.eye(4), False
+        self.observed = True
         self.radius = radius
         self.changes: deque[tuple[float, float]] = deque(maxlen=ERRORS_KEPT)  # squared: radians², voxels², per axis
         self.told_errors: deque[tuple[float, float]] = deque(maxlen=ERRORS_KEPT)  # likewise, of what was told
@@ -116,7 +117,8 @@ class MotionModel:
         self.T_last_next = expected.T_last_next @ exp(
             expected.covariance[6:, :6] @ np.linalg.lstsq(of_pose, error, rcond=1e-12)[0]
         )
-        if seen is not None and seen.observed.all():
+        observed = seen is not None and bool(seen.observed.all())
+        if observed and self.observed:  # else the way from the last pose to here makes up for what that one was off
             moved = np.linalg.inv(self.T_map_scan) @ T_map_scan
             self.T_last_next = moved
             if self.begun:
@@ -125,7 +127,8 @@ class MotionModel:
                 there = moved_by(expected.told.sensor)  # the sensor's own motion
                 apart = np.linalg.inv(there) @ np.linalg.inv(expected.told.T_last_next) @ moved @ there
                 self.told_errors.append(squares(log(apart)))
-        self.T_map_scan, self.covariance, self.begun = T_map_scan, expected.covariance, True
+        self.T_map_scan, self.covariance = T_map_scan, expected.covariance
+        self.begun, self.observed = True, observed
         if seen is None:
             return
         about = about_centre(T_map_scan, seen.centre)
@@ -163,6 +166,7 @@ class MotionModel:
         """What ``restored`` needs; JSON types."""
         return {
             "T_map_scan": self.T_map_scan.tolist(), "T_last_next": self.T_last_next.tolist(), "begun": self.begun,
+            "observed": self.observed,
             "covariance": self.covariance.tolist(), "changes": list(self.changes),
             "told_errors": list(self.told_errors), "radius": self.radius,
         }  # fmt: skip
@@ -171,6 +175,7 @@ class MotionModel:
     def restored(cls, state: dict[str, Any]) -> MotionModel:
         model = cls(np.array(state["T_map_scan"]), state["radius"])
         model.T_last_next, model.begun = np.array(state["T_last_next"]), state["begun"]
+        model.observed = state["observed"]
         model.covariance = np.array(state["covariance"])
         for errors, kept in ((model.changes, state["changes"]), (model.told_errors, state["told_errors"])):
             errors.extend((rotation, shift) for rotation, shift in kept)

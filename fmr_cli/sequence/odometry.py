@@ -21,7 +21,6 @@ from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
-from fmr_cli.sequence.observability import RELIABLE
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
@@ -56,8 +55,8 @@ MATTERS = 0.5
 # are, or go back to where a keyframe stood.
 ASIDE, SAME = 2.0, 0.1
 # How reliable what they come back to must be, where normals are believed (``Observability.hint``). By hand: in made-up
-# pans over a blank wall (6 to 18 deg a frame), slides along one, corridors and tunnels all such poses were right, within
-# 0.04 voxels at hints above 0.35, 0.12 at 0; there were too few to tell where between the two a limit belongs.
+# pans over a blank wall (6 to 18 deg a frame), slides along one, corridors and tunnels all such poses were right,
+# within 0.04 voxels at hints above 0.35, 0.12 at 0; too few to tell where between the two a limit belongs.
 HINTED = 1 / 3
 ABOUT_AS_WELL = 1.5  # times the ``total`` of a pose that leaves directions open, for one that leaves none
 LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew at the prediction
