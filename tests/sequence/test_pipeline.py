@@ -50,9 +50,13 @@ def test_each_row_is_told_with_its_place(street):
     assert told == [(0, 1, 3), (1, 2, 3), (2, 3, 3)]
 
 
-@pytest.mark.parametrize("options", [SequenceOptions(), SequenceOptions(deskew=True)], ids=["plain", "deskewed"])
-def test_cut_off_and_gone_on_with_it_comes_to_the_same_poses_and_the_same_map(moving, tmp_path, options):
-    scans = find_scans(moving[0], stop=5)
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [("street", SequenceOptions()), pytest.param("moving", SequenceOptions(deskew=True), marks=pytest.mark.slow)],
+    ids=["plain", "deskewed"],
+)
+def test_cut_off_and_gone_on_with_it_comes_to_the_same_poses_and_the_same_map(request, tmp_path, kind, options):
+    scans = find_scans(request.getfixturevalue(kind)[0], stop=5)
     whole = align_sequence(scans, tmp_path / "whole.txt", options, merged=tmp_path / "whole.ply")
     out, merged = tmp_path / "cut.txt", tmp_path / "cut.ply"
     with pytest.raises(CutError):
