@@ -34,19 +34,35 @@ def normals_and_variation(
     return normals, least / np.maximum(sum(products[:3]), 1e-300), reach, lean
 
 
+def principal_variances(
+    xx: np.ndarray, yy: np.ndarray, zz: np.ndarray, xy: np.ndarray, xz: np.ndarray, yz: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The eigenvalues of symmetric 3x3 matrices by their entries (M,): (M,) each, ascending."""
+    mean, p, angle = roots(xx, yy, zz, xy, xz, yz)
+    least, most = mean + 2 * p * np.cos(angle + 2 * np.pi / 3), mean + 2 * p * np.cos(angle)
+    return least, 3 * mean - most - least, most
+
+
+def roots(
+    xx: np.ndarray, yy: np.ndarray, zz: np.ndarray, xy: np.ndarray, xz: np.ndarray, yz: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean m, spread p and angle a (M,) of such matrices' eigenvalues m + 2 p cos(a + 2 pi k / 3) (Smith 1961)."""
+    mean = (xx + yy + zz) / 3
+    a, b, c = xx - mean, yy - mean, zz - mean
+    p = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+    return mean, p, np.arccos(np.clip(det / np.maximum(2 * p**3, 1e-300), -1, 1)) / 3
+
+
 def smallest_eigenvector(
     xx: np.ndarray, yy: np.ndarray, zz: np.ndarray, xy: np.ndarray, xz: np.ndarray, yz: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of symmetric 3x3 matrices by their entries (M,): the unit eigenvector (M, 3) of the smallest eigenvalue (M,).
 
-    In closed form (Smith 1961), several times faster than LAPACK on matrices this small, which still solves the few
-    where two eigenvalues are too close for it.
+    In closed form, several times faster than LAPACK on matrices this small, which still solves the few where two
+    eigenvalues are too close for it.
     """
-    mean = (xx + yy + zz) / 3
-    a, b, c = xx - mean, yy - mean, zz - mean
-    p = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
-    det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
-    angle = np.arccos(np.clip(det / np.maximum(2 * p**3, 1e-300), -1, 1)) / 3
+    mean, p, angle = roots(xx, yy, zz, xy, xz, yz)
     least = mean + 2 * p * np.cos(angle + 2 * np.pi / 3)
     # The eigenvector is orthogonal to the rows of the matrix less its eigenvalue: the longest of their cross products.
     a, b, c = xx - least, yy - least, zz - least

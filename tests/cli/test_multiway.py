@@ -46,9 +46,9 @@ RUN = ("multiway", "scans", "--aligned", "--anchor", "s2", "--merged", "all.ply"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, fmr, scans):
-    """One run that several tests look at: (its folder, what it said)."""
+    """One run of three scans that several tests look at: (its folder, what it said)."""
     folder = tmp_path_factory.mktemp("run")
-    shutil.copytree(scans / "scans", folder / "scans")
+    shutil.copytree(scans / "scans", folder / "scans", ignore=shutil.ignore_patterns("s3.ply"))
     return folder, fmr(*RUN, cwd=folder)
 
 
@@ -66,14 +66,14 @@ def result(folder):
 def test_what_is_written(run, clouds, worst_pose):
     folder, done = run
     assert done.returncode == 0, done.stderr
-    assert "4 of 4 scans placed" in done.stderr
+    assert "3 of 3 scans placed" in done.stderr
     scans = table(folder / "out" / "scans.csv")
-    assert [row["scan"] for row in scans] == [f"s{n}" for n in range(4)]
+    assert [row["scan"] for row in scans] == ["s0", "s1", "s2"]
     assert {row["status"] for row in scans} == {"placed"}
     assert {row["component"] for row in scans} == {"0"}
     poses = [np.loadtxt(folder / "out" / row["pose"]) for row in scans]
     assert np.array_equal(poses[2], np.eye(4))
-    assert worst_pose(poses, clouds[1]) < 0.03
+    assert worst_pose(poses, clouds[1][:3]) < 0.03
     links = table(folder / "out" / "links.csv")
     assert {row["status"] for row in links} <= {"aligned", "uncertain", "failed", "rejected"}
     by_name = {row["scan"]: pose for row, pose in zip(scans, poses, strict=True)}
@@ -84,13 +84,13 @@ def test_what_is_written(run, clouds, worst_pose):
             assert np.linalg.norm((T - network)[:3, :3]) < 0.1
             assert float(row["residual_rot_deg"]) < 3
     network = json.loads((folder / "out" / "network.json").read_text())
-    assert network["components"] == [{"anchor": "s2", "scans": [f"s{n}" for n in range(4)]}]
+    assert network["components"] == [{"anchor": "s2", "scans": ["s0", "s1", "s2"]}]
     g2o = (folder / "out" / "network.g2o").read_text().splitlines()
-    assert sum(line.startswith("VERTEX_SE3:QUAT") for line in g2o) == 4
+    assert sum(line.startswith("VERTEX_SE3:QUAT") for line in g2o) == 3
     assert all(len(line.split()) == 31 for line in g2o if line.startswith("EDGE_SE3:QUAT"))
     merged = read_cloud(folder / "all.ply")
     assert np.array_equal(merged.attributes["scan_id"], merged.attributes["intensity"])
-    assert len(merged) == sum(map(len, clouds[0]))
+    assert len(merged) == sum(map(len, clouds[0][:3]))
     moved = read_cloud(folder / "out" / "aligned" / "s1.ply")
     expected = clouds[0][1] @ poses[1][:3, :3].T + poses[1][:3, 3]
     assert np.allclose(moved.points, expected)
@@ -111,11 +111,11 @@ def test_gtsam_reads_the_graph(run):
     import gtsam
 
     graph, values = gtsam.readG2o(str(run[0] / "out" / "network.g2o"), True)
-    assert values.size() == 4
+    assert values.size() == 3
     found = gtsam.LevenbergMarquardtOptimizer(
         anchored(graph, values, gtsam), values
     ).optimize()  # moves little: the graph's links are those of the network
-    for n in range(4):
+    for n in range(3):
         apart = values.atPose3(n).inverse().compose(found.atPose3(n)).translation()
         assert np.linalg.norm(apart) < 0.05
 
@@ -138,7 +138,7 @@ def wait_for_lines(process, journal, count):
 
 
 @pytest.mark.slow
-def test_ctrl_c_and_a_kill_lose_no_link_and_resume_gives_the_same(fmr, folder, run):
+def test_ctrl_c_and_a_kill_lose_no_link_and_resume_gives_the_same(fmr, folder):
     journal = folder / "out" / "journal.jsonl"
     process = started(folder)
     wait_for_lines(process, journal, 2)
@@ -161,8 +161,11 @@ def test_ctrl_c_and_a_kill_lose_no_link_and_resume_gives_the_same(fmr, folder, r
     assert "--resume" in refused.stderr
     assert fmr(*RUN, "--resume", "-q", cwd=folder).returncode == 0
     assert journal.read_text().splitlines()[: len(kept)] == kept, "what was done is not done again"
-    assert result(folder / "out") == result(run[0] / "out")
     assert not (folder / "out" / "work").exists()
+    resumed = result(folder / "out")
+    shutil.rmtree(folder / "out")
+    assert fmr(*RUN, "-q", cwd=folder).returncode == 0
+    assert result(folder / "out") == resumed
 
 
 @pytest.mark.slow
@@ -188,8 +191,8 @@ def test_a_full_disk_is_one_line_and_loses_nothing(fmr, folder):
     assert journal.read_bytes().startswith(kept)
 
 
-def test_resume_refuses_other_settings(fmr, folder, run):
-    shutil.copytree(run[0] / "out", folder / "out")
+def test_resume_refuses_other_settings(fmr, run):
+    folder, _ = run
     before = result(folder / "out")
     done = fmr(*RUN, "--resume", "--seed", "1", cwd=folder)
     assert done.returncode == 2
@@ -200,6 +203,8 @@ def test_resume_refuses_other_settings(fmr, folder, run):
 
 @pytest.mark.slow
 def test_what_cannot_be_joined_is_exit_code_3_and_said(fmr, folder):
+    for name in ("s2.ply", "s3.ply"):
+        (folder / "scans" / name).unlink()
     points = np.random.default_rng(0).normal(size=(2000, 3))
     write_cloud(folder / "scans" / "noise.ply", PointCloud(points))
     (folder / "scans" / "broken.ply").write_text("ply\n")
@@ -210,7 +215,7 @@ def test_what_cannot_be_joined_is_exit_code_3_and_said(fmr, folder):
     rows = {row["scan"]: row for row in table(folder / "out" / "scans.csv")}
     assert (rows["noise"]["status"], rows["noise"]["pose"], rows["noise"]["component"]) == ("unplaced", "", "")
     assert rows["broken"]["status"] == "failed"
-    assert [rows[f"s{n}"]["status"] for n in range(4)] == ["placed"] * 4
+    assert [rows[name]["status"] for name in ("s0", "s1")] == ["placed"] * 2
     assert 100 < len(read_cloud(folder / "all.ply")) < 10_000
 
 

@@ -44,14 +44,10 @@ def spoilt(scans, poses, how):
     return [PointCloud(points) for points in scans], np.linalg.inv(poses[0]) @ poses
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "blank",
-        "gap",
-        *[pytest.param(how, marks=pytest.mark.slow) for how in ("upside down", "spun", "doubled", "another sensor")],
-    ],
-)
+@pytest.mark.parametrize("how", [
+    "upside down", "blank",
+    *(pytest.param(how, marks=pytest.mark.slow) for how in ("spun", "doubled", "another sensor", "gap")),
+])  # fmt: skip
 def test_it_is_placed_or_bridged_and_nothing_else_is_lost(street_drive, how):
     scans, truth = spoilt(*street_drive, how)
     found = align_sequence(scans)

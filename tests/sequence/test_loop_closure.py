@@ -37,6 +37,7 @@ def test_a_drifted_round_is_closed():
     assert np.linalg.norm(closed[:, :3, 3] * VOXEL - truth[:, :3, 3], axis=1).max() < 1.2
 
 
+@pytest.mark.slow
 def test_a_corridor_that_repeats_is_no_loop(monkeypatch):
     """34 m of bays that are all alike: every place looks like every other one, and none is seen twice."""
     things = [wall(1, 1.5), wall(1, -1.5), wall(2, -1.2), wall(2, 1.6)]

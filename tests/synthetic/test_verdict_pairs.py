@@ -31,9 +31,17 @@ def draft_of(kind: str, seed: int) -> Draft:
             continue
 
 
+class Pairs(dict[str, VerdictPair]):
+    """A pair of each kind, made when it is asked for: test processes make those of their own tests."""
+
+    def __missing__(self, kind: str) -> VerdictPair:
+        self[kind] = fresh_pair(kind, 5, 0)
+        return self[kind]
+
+
 @pytest.fixture(scope="module")
-def pairs() -> dict[str, VerdictPair]:
-    return {kind: fresh_pair(kind, 5, 0) for kind in KINDS}
+def pairs() -> Pairs:
+    return Pairs()
 
 
 def near(pair: VerdictPair, T: np.ndarray, share: float = 0.02) -> float:

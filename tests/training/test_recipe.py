@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fmr_cli.training.recipe import LocalRecipe, Recipe, RecipeError, read_recipe
+from fmr_cli.training.recipe import LocalRecipe, Recipe, RecipeError, ScanRecipe, read_recipe
 
 
 def test_a_recipe_survives_its_file(tmp_path):
@@ -62,3 +62,11 @@ def test_a_local_recipe_survives_its_file_and_has_no_settings_of_the_global_one(
 def test_the_bundled_recipes_can_be_read(name):
     recipe = read_recipe(Path(__file__).parents[2] / f"models/{name}.toml")
     assert (recipe.kind, recipe.start) == ("local" if name == "local" else "global", "scratch")
+
+
+def test_longer_runs_have_more_material_and_short_ones_no_share_for_the_global_encoder():
+    one, ten = ScanRecipe().within(1), ScanRecipe().within(10)
+    assert one.scans < ten.scans <= 40  # every two of them may be registered, which a minute has no time for
+    assert one.pairs < ten.pairs
+    assert one.made_up < ten.made_up
+    assert one.whole_every == 0 < ten.whole_every
