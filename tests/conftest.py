@@ -38,7 +38,7 @@ def room_scans() -> tuple[np.ndarray, np.ndarray]:
 def street(tmp_path_factory):
     """A folder of KITTI .bin scans of a drive that is in motion from its first scan on, and the true poses."""
     folder = tmp_path_factory.mktemp("street")
-    rng, place, poses = np.random.default_rng(1), make_street(60), drive(60)[:8]
+    rng, place, poses = np.random.default_rng(1), make_street(60), drive(60, speed=4.0)[:8]
     for i, pose in enumerate(poses):
         points = scan(place, pose, rng, columns=450)
         write_cloud(folder / f"{i}.bin", PointCloud(points, {"intensity": np.full(len(points), i, np.float32)}))

@@ -10,12 +10,25 @@ from fmr_cli.errors import CloudFileError
 TIME_FIELDS = ("gps_time", "time", "timestamp", "t", "offset_time", "time_offset")
 
 
+def time_field(cloud: PointCloud) -> str | None:
+    """The name of the field that holds the points' times, or None."""
+    return next((n for n in TIME_FIELDS if n in cloud.attributes and cloud.attributes[n].ndim == 1), None)
+
+
+def time_span(cloud: PointCloud) -> tuple[float, float] | None:
+    """When a scan's first and last point were measured, in the file's own unit (int or float); None if unknown."""
+    name = time_field(cloud)
+    values = cloud.attributes[name] if name else np.zeros(0)
+    values = values[np.isfinite(values)]
+    return (values.min().item(), values.max().item()) if len(values) else None
+
+
 def scan_times(cloud: PointCloud) -> np.ndarray:
     """(N,) when each point was measured: 0 for the scan's first, 1 for its last, whatever unit the file has.
 
     A point whose time is not finite gets the middle. Raises CloudFileError where no field tells times apart.
     """
-    name = next((n for n in TIME_FIELDS if n in cloud.attributes and cloud.attributes[n].ndim == 1), None)
+    name = time_field(cloud)
     if name is None:
         known = ", ".join(TIME_FIELDS)
         raise CloudFileError(f"{cloud.name}: has no time per point (fields {known}), use --no-deskew")

@@ -13,7 +13,8 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError, FmrError
-from fmr_cli.sequence.deskew import deskew, scan_times
+from fmr_cli.geometry.se3 import exp, log
+from fmr_cli.sequence.deskew import deskew, scan_times, time_span
 from fmr_cli.sequence.journal import Beginning
 from fmr_cli.sequence.prepared_scan import PreparedScan, prepare_scan
 from fmr_cli.sequence.scans import Scans
@@ -54,6 +55,7 @@ class Loader:
         self.scans, self.beginning, self.T_first_scan = scans, beginning, T_first_scan
         self.deskewed, self.strict, self.keep_clouds = deskewed, strict, keep_clouds
         self.usual_sizes: deque[float] = deque(maxlen=SIZES_KEPT)
+        self.spans: dict[int, tuple[float, float] | None] = {}  # see ``time_span``, by frame
 
     def ahead(self, start: int) -> Generator[Loaded, None, None]:
         """Each scan from index ``start`` on, read while those before it are registered."""
@@ -94,6 +96,8 @@ class Loader:
         except CloudFileError as error:
             loaded.row["message"] = str(error)
             return loaded
+        if self.deskewed:
+            self.spans[index] = time_span(loaded.cloud)
         loaded.row |= {"points": len(loaded.cloud), "read_s": round(time.perf_counter() - begin, 4)}
         if not self.deskewed:
             self._thin(loaded)
@@ -118,7 +122,7 @@ class Loader:
         loaded.row["prepare_s"] = round(time.perf_counter() - begin, 4)
 
     def _without_motion(self, cloud: PointCloud, index: int) -> PointCloud:
-        """The scan deskewed, by constant velocity from the two frames before it."""
+        """The scan deskewed, by constant velocity from the two frames before it, for as long as it lasts."""
         if not self.deskewed:
             return cloud
         try:
@@ -130,7 +134,23 @@ class Loader:
         T_begin_end = self.beginning.T_first_second
         if index > 1:
             T_begin_end = np.linalg.inv(self.T_first_scan[index - 2]) @ self.T_first_scan[index - 1]
+        T_begin_end = exp(self._share(index) * log(T_begin_end))
         return replace(cloud, points=deskew(cloud.points, times, T_begin_end))
+
+    def _share(self, index: int) -> float:
+        """How long a scan lasts over the time from one to the next; 1 where times begin anew in each scan."""
+        earlier, later, own = (self._span(i) for i in (max(index, 1) - 1, max(index, 1), index))
+        if earlier is None or later is None or own is None or not later[0] > earlier[0]:
+            return 1.0
+        return min((own[1] - own[0]) / (later[0] - earlier[0]), 1.0)
+
+    def _span(self, index: int) -> tuple[float, float] | None:
+        if index not in self.spans:
+            try:
+                self.spans[index] = time_span(self.scans.read(index, attributes=True))
+            except CloudFileError:
+                self.spans[index] = None
+        return self.spans[index]
 
     def _refuse_odd_size(self, loaded: Loaded) -> None:
         """A scan of quite another size than those before it is most often one in another unit."""

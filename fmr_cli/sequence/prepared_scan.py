@@ -12,6 +12,7 @@ import small_gicp
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
+from fmr_cli.geometry.normals import principal_variances, smallest_eigenvector
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
-POINTS_PER_VOXEL = 1.4  # of a scan that has few points, on average: finer voxels would hold single points
+POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold noise
 # Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
 # they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
 HELD = 2.2
@@ -79,7 +80,7 @@ class PreparedScan:
             small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
         on_line = np.flatnonzero(~self.solid)
         wider = scatter(self.points, neighbours(tree, self.points[on_line], MANY_NEIGHBOURS))
-        self.normals[on_line] = np.linalg.eigh(matrices(wider))[1][:, :, 0]
+        self.normals[on_line] = smallest_eigenvector(*wider)[0]
         self.solid[on_line] = ~lines(wider)
 
     def __len__(self) -> int:
@@ -88,7 +89,7 @@ class PreparedScan:
     @cached_property
     def tilt(self) -> np.ndarray:
         """(N,), rad: how far the neighbours of a point stray from their plane, seen from where they lie along it."""
-        least, middle, _ = principal_variances(self._scatter)
+        least, middle, _ = principal_variances(*self._scatter)
         return np.sqrt(np.maximum(least, 0) / np.maximum(middle, 1e-12))
 
     def trust(self, at_least: float = 0.0) -> np.ndarray:
@@ -139,23 +140,6 @@ def scatter(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     return np.stack([np.einsum("ij,ij->j", a, b) for a, b in pairs]) / near.shape[1]
 
 
-def matrices(six: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of ``scatter``."""
-    return six[[0, 3, 4, 3, 1, 5, 4, 5, 2]].T.reshape(-1, 3, 3)
-
-
-def principal_variances(six: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The eigenvalues of ``scatter``, (N,) each, ascending: in closed form, a fifth of LAPACK's time (Smith 1961)."""
-    xx, yy, zz, xy, xz, yz = six
-    mean = (xx + yy + zz) / 3
-    a, b, c = xx - mean, yy - mean, zz - mean
-    radius = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
-    half_det = (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)) / 2
-    angle = np.arccos(np.clip(half_det / np.maximum(radius**3, 1e-300), -1, 1)) / 3
-    most, least = mean + 2 * radius * np.cos(angle), mean + 2 * radius * np.cos(angle + 2 * np.pi / 3)
-    return least, 3 * mean - most - least, most
-
-
 def lines(six: np.ndarray) -> np.ndarray:
     """(N,), whether neighbourhoods lie on a line, by the invariants of their covariances (``scatter``).
 
@@ -193,7 +177,7 @@ def suitable_voxel(points: np.ndarray) -> float:
 
     It leaves WORKING_POINTS at most, and POINTS_PER_VOXEL in each on average. Raises RegistrationError.
     """
-    wanted = min(WORKING_POINTS, int(len(points) / POINTS_PER_VOXEL))
+    wanted = min(WORKING_POINTS, len(points) // POINTS_PER_VOXEL)
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
     if not spread > 0 or wanted < MIN_POINTS:
         raise RegistrationError("too few points, or all in one place")
@@ -223,6 +207,6 @@ def grain(points: np.ndarray) -> tuple[float, float]:
         return 0.0, 0.0
     points = thinned.points()[:, :3]
     index, squared = small_gicp.KdTree(thinned).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
-    least, middle, most = principal_variances(scatter(points, index.astype(np.int64)))
+    least, middle, most = principal_variances(*scatter(points, index.astype(np.int64)))
     flat = np.maximum(least[middle > LINE * most], 0)
     return float(np.sqrt(np.median(squared[:, -1]))), float(np.sqrt(np.quantile(flat, 0.25))) if len(flat) else 0.0

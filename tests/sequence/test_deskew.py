@@ -9,6 +9,10 @@ from scipy.linalg import expm
 from fmr_cli import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.sequence.deskew import deskew, scan_times
+from fmr_cli.sequence.journal import Beginning
+from fmr_cli.sequence.loader import Loader
+from fmr_cli.sequence.scans import as_scans
+from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 
 def test_a_turning_scanner_is_undone_to_half_a_millimetre():
@@ -38,3 +42,12 @@ def test_times_in_any_unit(name, values):
 def test_one_time_for_all_points_is_an_error():
     with pytest.raises(CloudFileError, match="field time is the same for all points"):
         scan_times(PointCloud(np.zeros((3, 3)), {"time": np.ones(3)}))
+
+
+@pytest.mark.parametrize(("begins", "share"), [(0.5, 0.2), (0.1, 1.0), (0.0, 1.0)])
+def test_a_scan_may_last_less_than_the_time_to_the_next(begins, share):
+    """0.1 s each, beginning so much later than the one before; 0: times begin anew in each scan."""
+    scans = [PointCloud(np.zeros((50, 3)), {"time": 100.0 + begins * i + np.linspace(0, 0.1, 50)}) for i in range(3)]
+    beginning = Beginning(VoxelFrame(1.0, np.zeros(3)), np.eye(4))
+    loader = Loader(as_scans(scans), beginning, [], deskewed=True, strict=True, keep_clouds=False)
+    assert [loader._share(index) for index in range(3)] == pytest.approx([share] * 3)

@@ -43,6 +43,16 @@ def test_unseen_the_sigma_grows_and_seen_again_it_shrinks():
     assert moved(model, 1, all_seen(0.01)).sigma(np.zeros(3))[1] < 0.02
 
 
+def test_what_an_unseen_pose_was_off_is_not_taken_for_motion():
+    """Unseen it is left where it was for two frames, and then found three motions on: it is not three times as fast."""
+    model = moved(MotionModel(np.eye(4), 20.0), 10, all_seen(0.01))
+    goal = model.T_map_scan @ MOTION @ MOTION @ MOTION
+    for _ in range(2):
+        model.advance(model.T_map_scan, model.expect(), None)
+    model.advance(goal, model.expect(), all_seen(0.01))
+    assert np.linalg.norm((np.linalg.inv(goal) @ model.expect().T_map_scan)[:3, 3]) < 1.5 * 3.0
+
+
 def test_a_fit_counts_only_where_it_has_observed():
     model = moved(MotionModel(np.eye(4), 20.0), 10, all_seen(0.01))
     expected = model.expect()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from degenerate import block, camera, placed, seen, spinning, tunnel, wall
@@ -11,6 +13,7 @@ from fmr_cli.cloud import angle_degrees
 from fmr_cli.io import read_poses
 from fmr_cli.sequence import align_sequence
 from fmr_cli.sequence.observability import WRONG, Matches, in_words, observe
+from fmr_cli.synthetic.drives import Drive, Way, depth_camera, passages
 
 
 def drive(things, poses, rays, noise, reach):
@@ -35,25 +38,25 @@ def certain(found):
     [
         ([tunnel(4.0)], 0.02),
         pytest.param([tunnel(4.0)], 0.003, marks=pytest.mark.slow),
-        pytest.param([wall(1, 1.2), wall(1, -1.2), wall(2, -1.2), wall(2, 1.4)], 0.01, marks=pytest.mark.slow),
+        ([wall(1, 1.2), wall(1, -1.2), wall(2, -1.2), wall(2, 1.4)], 0.01),
     ],
     ids=["tunnel", "tunnel, a clean scanner", "corridor"],
 )
 def test_along_a_smooth_tube_no_frame_is_called_certain(things, noise):
-    found, _ = drive(things, [placed(0.5 * i, 0.1, -0.3) for i in range(6)], spinning(), noise, 40.0)
+    found, _ = drive(things, [placed(0.5 * i, 0.1, -0.3) for i in range(4)], spinning(), noise, 40.0)
     assert not certain(found)[1:].any()
     assert all("shift along (1.00, 0.0" in row["unobserved"] for row in found.rows[1:])
-    assert any("frames 1 to 5: shift along (1.00, 0.0" in line for line in found.summary())
+    assert any("frames 1 to 3: shift along (1.00, 0.0" in line for line in found.summary())
 
 
 def test_standing_in_a_tunnels_mouth_it_stays_where_it_is():
     ground = wall(2, -2.0, lambda p: (p[:, 0] > 0) | (np.abs(p[:, 1]) < 3))
-    found, truth = drive([tunnel(4.0, end=0.0), ground], [placed(0.5)] * 8, spinning(), 0.02, 60.0)
+    found, truth = drive([tunnel(4.0, end=0.0), ground], [placed(0.5)] * 5, spinning(), 0.02, 60.0)
     assert errors(found, truth)[0].max() < 0.1
 
 
 def test_open_ground_leaves_three_motions_open():
-    found, _ = drive([wall(2, -2.0)], [placed(0.8 * i) for i in range(4)], spinning(), 0.02, 80.0)
+    found, _ = drive([wall(2, -2.0)], [placed(0.8 * i) for i in range(3)], spinning(), 0.02, 80.0)
     assert not certain(found)[1:].any()
     assert found.rows[1]["unobserved"].count("shift along") == 2
     assert "rotation about (0.00, 0.00, 1.00)" in found.rows[1]["unobserved"]
@@ -82,6 +85,29 @@ def test_through_a_tunnel_it_goes_on_as_it_came_and_says_where_it_did_not_see():
     assert all(row["unobserved"].startswith("shift along (1.00") for row in uncertain)
     largest = max(row["sigma_shift"] for row in uncertain)
     assert shift.max() < 3 * largest
+
+
+def test_rings_across_a_corridors_floor_and_ceiling_hold_height_and_tilt():
+    """16 beams: floor and ceiling are single rings, far apart; boxes on the walls tell the way along it."""
+    things = [wall(1, 1.2), wall(1, -1.2), wall(2, -1.0), wall(2, 1.8)]
+    things += [block((x, 1.0, -1.0), (x + 0.5, 1.2, 0.8)) for x in range(-20, 30, 4)]
+    things += [block((x, -1.2, -1.0), (x + 0.7, -0.95, 0.5)) for x in range(-17, 30, 5)]
+    poses = [placed(0.24 * i, 0.02 * i) for i in range(8)]
+    found, truth = drive(things, poses, spinning(16, 900, -15.0, 15.0), 0.02, 60.0)
+    shift, angle = errors(found, truth)
+    assert certain(found)[2:].all()  # the first motion of all is the hardest
+    assert shift[2:].max() < 0.05
+    assert angle[2:].max() < 0.7
+
+
+def test_a_camera_along_a_corridor_is_held_by_what_stands_out_from_its_walls():
+    """Cupboards a hand deep, seen in a few dozen points: starts on both sides find back to one pose."""
+    scene, corners = passages(np.random.default_rng(0), 24.0, 16.0, 2.4, 0.0)
+    walk = Drive(scene, Way(corners, 0.8, wobble=0.5), depth_camera(), 10.0)
+    found, truth = align_sequence(list(islice(walk.scans(), 8))), walk.truth()[:8]
+    sure, (shift, _) = certain(found), errors(found, truth)
+    assert sure.sum() >= 5
+    assert shift[sure].max() < 0.05
 
 
 def test_a_camera_that_pans_past_a_blank_wall_is_right_or_says_so():
