@@ -45,7 +45,7 @@ def test_a_bend_is_followed_to_two_thousandths_of_its_length(turning):
     assert first < 0.02
 
 
-@pytest.mark.parametrize("every", [-1, 3])
+@pytest.mark.parametrize("every", [pytest.param(-1, marks=pytest.mark.slow), 3])
 def test_backwards_and_every_third_scan(turning, every):
     scans, truth = turning
     frames = run(scans[::every])

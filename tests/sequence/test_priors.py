@@ -58,6 +58,7 @@ def test_a_name_that_no_scan_has_is_one_line(street):
         align_sequence(street[0], init_poses={"77": KnownPose(np.eye(4))})
 
 
+@pytest.mark.slow
 def test_the_tunnel_of_the_shared_data(shared_data):
     home = shared_data / "cases" / "sequences"
     names = sorted(file.name for file in (home / "tunnel").iterdir())
