@@ -27,7 +27,8 @@ CHANCE = 0.05  # that a wrong hypothesis agrees with another one, at least
 # contradiction below 1.2; of the right ones half are below 0.1.
 CONFIRMS, ENOUGH = 4.6, 800  # log odds that views add to a pose that they find nothing against; points that must agree
 UNLIKELY = 0.01  # confidence of a hypothesis, below which it speaks for nothing
-JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself or two agree
+JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
+DOUBTFUL = 0.9  # the same where none is, but several agree: two rooms that resemble each other agree in a doubtful way
 DENIALS = (
     (0.5, 3.0),
     (0.3, 1.0),
@@ -51,7 +52,7 @@ class Component:
 class Join:
     """A pose between two components. probability: that it is right; against: the probability of the best rival.
 
-    links: that agree on it, by number; sound: one is aligned by itself, or they are two; denied: how many deny it.
+    links: that agree on it, by number; sound: one is aligned by itself; denied: how many deny it.
     """
 
     T_second_first: np.ndarray
@@ -61,6 +62,11 @@ class Join:
     links: tuple[int, ...]
     denied: int
     sound: bool
+
+    @property
+    def holds(self) -> bool:
+        """Whether scans are joined by it: a doubtful link never does so alone, nor do several that leave a doubt."""
+        return self.probability >= (JOINED if self.sound else DOUBTFUL) and (self.sound or len(self.links) > 1)
 
 
 @dataclass(frozen=True)
@@ -236,7 +242,7 @@ def joined(
         hopeful = [
             (join.log_odds, -key[0], -key[1])
             for key, join in joins.items()
-            if (join.probability >= JOINED and join.sound if key in exact else join.log_odds > 0)
+            if (join.holds if key in exact else join.log_odds > 0)
         ]
         if not hopeful:
             break
@@ -348,7 +354,7 @@ def joins_between(
             penalty = next((x for least, x in DENIALS if shared >= least), 0.0)
             denied += penalty > 0
             score -= penalty
-        sound = len(agreed) > 1 or any(claim.sound for claim in agreed.values())
+        sound = any(claim.sound for claim in agreed.values())
         best.append(Join(T_agreed, score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
     best.sort(key=lambda join: -join.log_odds)
     weights = np.exp(np.clip([join.log_odds for join in best], -50, 50))
