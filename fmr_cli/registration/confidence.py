@@ -33,9 +33,9 @@ OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: none of 892 righ
 DENIED = 0.1  # more contradicted than explained: none of 33 poses that stood first was right
 # Fewer points of detail than that, hardly more than a corner, which fits any other: 6 of 66 were right.
 BARE, IF_BARE = 5, 0.3
-# A rival that has ABOUT as much support and half as many matches again: 16 of 108 poses that stood first were right.
+# A rival that has ABOUT as much support, weighs FITS as much and has half as many matches again: 10 of 86 poses that stood first were right.
 # They fit a little better where they meet less of the other scan, as a facade that is shifted beyond its only door.
-OUTVOTED, ABOUT, IF_OUTVOTED = np.log(1.5), 0.9, 0.3
+OUTVOTED, ABOUT, FITS, IF_OUTVOTED = np.log(1.5), 0.9, 0.25, 0.3
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
 RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be right
@@ -124,7 +124,7 @@ def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray
     weigh, first = standing(x, weights)
     p = float(sigmoid(products(first[None], weights)[0] @ weights.verdict))
     best = int(weigh.argmax())
-    p = min(p, most(x[best]), IF_OUTVOTED if outvoted(x, best, weights) else 1.0)
+    p = min(p, most(x[best]), IF_OUTVOTED if outvoted(x, weigh, weights) else 1.0)
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
     shares[best] = p
@@ -141,10 +141,13 @@ def most(x: np.ndarray) -> float:
     return min([p for holds, p in bounds if holds], default=1.0)
 
 
-def outvoted(x: np.ndarray, best: int, weights: Weights) -> bool:
-    """Whether clearly more matches agree with another one of poses with evidence x (n, d) that is about as likely."""
-    supports = support(x, weights)
-    others = (np.arange(len(x)) != best) & (supports >= ABOUT * supports[best])
+def outvoted(x: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
+    """Whether clearly more matches agree with a rival of the first of poses that is about as likely and fits nearly so.
+
+    x: (n, d) their evidence; weigh: (n,) what each weighs among them, see ``standing``.
+    """
+    best, supports = int(weigh.argmax()), support(x, weights)
+    others = (supports >= ABOUT * supports[best]) & (weigh >= FITS * weigh[best])
     return bool((x[others, VOTES] > x[best, VOTES] + OUTVOTED).any())
 
 
