@@ -33,8 +33,8 @@ OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: none of 892 righ
 DENIED = 0.1  # more contradicted than explained: none of 33 poses that stood first was right
 # Fewer points of detail than that, hardly more than a corner, which fits any other: 6 of 66 were right.
 BARE, IF_BARE = 5, 0.3
-# A rival that has ABOUT as much support, weighs FITS as much and has half as many matches again: 10 of 86 poses that stood first were right.
-# They fit a little better where they meet less of the other scan, as a facade that is shifted beyond its only door.
+# A rival that has ABOUT as much support, weighs FITS as much and has half as many matches again: 10 of 86 poses that
+# stood first were right. They fit a little better for meeting less of the other scan: a facade beyond its only door.
 OUTVOTED, ABOUT, FITS, IF_OUTVOTED = np.log(1.5), 0.9, 0.25, 0.3
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
