@@ -11,8 +11,8 @@ import numpy as np
 PLANES = 3
 POINTS, SEEDS = 1000, 60  # points that are looked at, and those of them whose tangent planes are tried
 ALONG = 0.85  # |cosine| between a point's normal and its plane's: noise turns normals by 20 deg, 30 deg are a bend
-OFF = 1.5  # voxel edges that a point of a plane may lie off, and the least: beside an edge, voxels average both sides
-LEAST_OFF, SIGMAS = 0.5, 4.0  # between them, times the plane's own scatter: a window's recess is no noise of its wall
+OFF = 1.5  # voxel edges that a point of a plane may lie off at most: beside an edge, voxels average both sides
+LEAST_OFF, SIGMAS = 0.5, 4.0  # at least, and times the plane's own scatter: a window's recess is no noise of its wall
 ACROSS = 0.5  # of a normal, the least share outside the span of the former planes': parallel planes make no corner
 
 
