@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fmr_cli.geometry.kernels import NORMAL
+
 PLANES = 3
 POINTS, SEEDS = 1000, 60  # points that are looked at, and those of them whose tangent planes are tried
 ALONG = 0.85  # |cosine| between a point's normal and its plane's: noise turns normals by 20 deg, 30 deg are a bend
@@ -45,7 +47,7 @@ def plane(points: np.ndarray, normals: np.ndarray, about: np.ndarray, edge: floa
         normal = np.linalg.eigh((points[about] - middle).T @ (points[about] - middle))[1][:, 0]
         off = np.abs((points - middle) @ normal)
         alike = (off < OFF * edge) & (np.abs(normals @ normal) > ALONG)
-        sigma = 1.4826 * np.median(off[alike]) if alike.any() else 0.0  # of a normal distribution
+        sigma = NORMAL * np.median(off[alike]) if alike.any() else 0.0
         on = off < np.clip(SIGMAS * sigma, LEAST_OFF * edge, OFF * edge)
         about = alike & on if (alike & on).sum() >= PLANES else about
     return normal, on

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from fmr_cli.geometry.arrays import Array
 
+NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
+
 
 def geman_mcclure(squared: Array, scale2: Array | float) -> Array:
     """The weight (s² / (s² + e²))² of Geman and McClure (1985) for squared residuals e² and the squared scale s².

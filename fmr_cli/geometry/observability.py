@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.geometry.kernels import geman_mcclure, geman_mcclure_slope
+from fmr_cli.geometry.kernels import NORMAL, geman_mcclure, geman_mcclure_slope
 from fmr_cli.geometry.point_to_plane import SCALE, linearise, normal_equations
 from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.geometry.surface import Surface
@@ -17,7 +17,6 @@ WEAK = 2e-3  # of the strongest direction's information: what the noise of the n
 REACH = 1.5  # voxel edges: correspondences further apart are no observations
 BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated, those of two blocks not
 BENDS = 8.0  # independent parts of a scan that is bent or drifted as a whole: half an extent each
-NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
 # Counted as left of a direction without a block: without the one block that alone holds it, nothing would be.
 LEFT = 1e-3
 LEAST_BLOCKS = 8  # fewer say nothing about the scatter of their sums

@@ -66,7 +66,9 @@ class Join:
     @property
     def holds(self) -> bool:
         """Whether scans are joined by it: a doubtful link never does so alone, nor do several that leave a doubt."""
-        return self.probability >= (JOINED if self.sound else DOUBTFUL) and (self.sound or len(self.links) > 1)
+        if self.sound:
+            return self.probability >= JOINED
+        return len(self.links) > 1 and self.probability >= DOUBTFUL
 
 
 @dataclass(frozen=True)
@@ -231,7 +233,7 @@ def joined(
         for join in rivals(key, exact=True):
             met = meeting(one, two, join.T_second_first, scans, moments)
             if forbidden(seen(met)):
-                refused.append(replace(join, denied=join.denied + len(met), sound=False))
+                refused.append(replace(join, denied=join.denied + len(met)))
                 between[key] = [claim for claim in between[key] if claim.link not in join.links]
         return rivals(key, exact=True)
 

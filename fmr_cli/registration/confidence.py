@@ -131,6 +131,15 @@ def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray
     return shares, weigh
 
 
+def among(confidence: float, others: Sequence[float]) -> float:
+    """What is left of a pose's confidence beside others of which at most one is right, each found by itself.
+
+    Each weighs its odds against "none of them", as if it were alone.
+    """
+    odds, *more = (p / max(1 - p, 1e-12) for p in (confidence, *others))
+    return odds / (1 + odds + sum(more))
+
+
 def most(x: np.ndarray) -> float:
     """The confidence that evidence x (d,) allows at most, whatever the weights say."""
     bounds = [

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fmr_cli.cloud import PointCloud, transform_points
-from fmr_cli.registration.confidence import ALIGNED, Candidate
+from fmr_cli.registration.confidence import ALIGNED, Candidate, among
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration
 
@@ -37,13 +37,12 @@ def unlikely(found: Registration) -> bool:
     return bool(against <= HARDLY * (explained + against) or found.evidence["explained_share"] > HALF)
 
 
-def weighed(found: Registration, image: Candidate) -> Registration:
-    """What is left of a pose beside the mirror image's best one: where that fits more, they share by their odds."""
-    share, other = found.evidence["explained_share"], image.evidence.explained_share
-    if other <= share:
+def weighed(found: Registration, image: Candidate | None) -> Registration:
+    """What is left of a pose beside the mirror image's, if there is one: where that explains more, it has its share."""
+    share, other = found.evidence["explained_share"], image.evidence.explained_share if image else 0.0
+    if image is None or other <= share:
         return found
-    odds, others = (p / max(1 - p, 1e-12) for p in (found.confidence, image.confidence))
-    confidence = odds / (1 + odds + others)
+    confidence = among(found.confidence, [image.confidence])
     aligned = confidence >= ALIGNED
     reasons = found.reasons if aligned else [BETTER.format(other, share), *found.reasons]
     return replace(found, confidence=confidence, status="aligned" if aligned else "uncertain", reasons=reasons)

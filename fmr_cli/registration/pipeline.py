@@ -57,21 +57,23 @@ def align(
     for options that contradict each other.
     """
     found = as_they_are(source, target, options, threads, check)
-    if found.status == "aligned" and mirror.unlikely(found):
+    aligned = found.status == "aligned"
+    if aligned and mirror.unlikely(found):
         return found
-    image = None
-    if found.status == "aligned" or (hints and not options.allow_mirror):
-        image = mirror_look(source, target, options)
-    if image and found.status == "aligned":
-        found = mirror.weighed(found, image)
+    fits = None
+    if aligned or (hints and not options.allow_mirror):
+        fits = mirror_look(source, target, options)
+    if aligned:
+        found = mirror.weighed(found, fits)
     if found.status == "aligned":
         return found
-    if not options.allow_mirror:
-        found.warnings += [mirror.HINT.format(image.confidence)] if image and hints else []
-        return found
-    mirrored = mirror.image(source, options.seed)
-    other = as_they_are(mirrored, target, options, threads, check)
-    return mirror.undone(other, mirrored.centre) if other.status == "aligned" else found
+    if options.allow_mirror:
+        image = mirror.image(source, options.seed)
+        other = as_they_are(image, target, options, threads, check)
+        return mirror.undone(other, image.centre) if other.status == "aligned" else found
+    if fits and hints:
+        found.warnings.append(mirror.HINT.format(fits.confidence))
+    return found
 
 
 def mirror_look(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options) -> Candidate | None:

@@ -16,7 +16,7 @@ import numpy as np
 from fmr_cli.cloud import transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.sampling import WITHIN
-from fmr_cli.registration.confidence import ALIGNED, Judge
+from fmr_cli.registration.confidence import ALIGNED, Judge, among
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.looks import FIRST, SURE, consider, features, further
 from fmr_cli.registration.options import Options
@@ -93,7 +93,6 @@ def look(source: Prepared, target: Prepared, options: Options, threads: int, tim
         for j in others
     ]
     elsewhere = [c for c in elsewhere if not pair.same(c.T_target_source, best.T_target_source)]
-    # At most one of them is right, or none: each weighs its odds against "none", as if it were alone.
-    odds = [c.confidence / max(1 - c.confidence, 1e-12) for c in (best, *elsewhere)]
-    judge.candidates = [replace(best, confidence=odds[0] / (1 + sum(odds))), *elsewhere, *judge.candidates[1:]]
+    confidence = among(best.confidence, [c.confidence for c in elsewhere])
+    judge.candidates = [replace(best, confidence=confidence), *elsewhere, *judge.candidates[1:]]
     return judge

@@ -33,8 +33,7 @@ class Prepared:
     points: (N, 3) float64, centred, at most AT_MOST, finite and distinct. frame: the centred coordinates, whose origin
     is the mean of the cloud. edge: the voxel edge that suits this cloud; spacing: of its points; reach: of most of them
     from their middle; file's unit. notes: what a person should know of it, as how many points are no surface (see
-    ``strays``). Raises
-    RegistrationError: fewer than 10 distinct points, all in one place.
+    ``strays``). Raises RegistrationError: fewer than 10 distinct points, all in one place.
     """
 
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:

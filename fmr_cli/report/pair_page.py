@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fmr_cli.cloud import PointCloud, transform_points
+from fmr_cli.geometry.kernels import NORMAL
 from fmr_cli.geometry.normals import neighbours, smallest_eigenvector
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.io import transform_text
@@ -23,7 +24,6 @@ from fmr_cli.report.points import packed, packed_shares, shown
 MEASURED = 200_000  # points of the target that residuals are measured to: their tree takes 0.1 s
 RESIDUALS = 2.0  # working voxel edges: the largest residual that is told from a larger one
 ALTERNATIVES = 5  # that can be switched to
-NOISE = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Target:
         some = sample(self.points, 5_000, np.random.default_rng(1))
         distance, index = neighbours(some, self.tree)
         self.spacing = float(np.median(distance[:, 1])) if distance.shape[1] > 1 else 0.0
-        self.noise = float(NOISE * np.median(self.off_planes(some, index)))
+        self.noise = float(NORMAL * np.median(self.off_planes(some, index)))
 
     def off_planes(self, points: np.ndarray, index: np.ndarray) -> np.ndarray:
         """How far points (N, 3) are off the planes through the target's points index (N, k): (N,)."""

@@ -10,7 +10,7 @@ import numpy as np
 import small_gicp
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.geometry.kernels import geman_mcclure
+from fmr_cli.geometry.kernels import NORMAL, geman_mcclure
 from fmr_cli.geometry.point_to_plane import linearise, normal_equations, step_motion
 from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.sequence.observability import Matches
@@ -113,7 +113,7 @@ def scale_by_band(r: np.ndarray, band: np.ndarray) -> np.ndarray:
     """Sigma (BANDS,) of the residuals |r| (n,) in each range band (n,); of all where a band has few."""
     usual = np.median(r)
     medians = [np.median(r[band == b]) if np.count_nonzero(band == b) > 5 else usual for b in range(BANDS)]
-    return np.maximum(1.4826 * np.array(medians), MIN_SIGMA)
+    return np.maximum(NORMAL * np.array(medians), MIN_SIGMA)
 
 
 def trust(sigma: np.ndarray, slope: float) -> np.ndarray:
