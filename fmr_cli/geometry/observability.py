@@ -75,7 +75,7 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     inverse = pseudo_inverse(A / np.outer(units, units))
     covariance = inverse * w.sum() * max(sum(misfits), 0.0) / 2 / BENDS
     block, index = np.unique(voxel_keys(y, BLOCK * target.edge), return_inverse=True)
-    covariance += range_bias(J, outward, w, r, variance, len(r) / len(block))
+    covariance += range_bias(J, outward, w, r, inverse, variance, len(r) / len(block))
     if len(block) >= LEAST_BLOCKS:
         covariance += sandwich(J, w * r, slope, index)
     else:
@@ -90,17 +90,23 @@ def outwards(points: np.ndarray, normals: np.ndarray, centre: np.ndarray) -> np.
 
 
 def range_bias(
-    J: np.ndarray, outward: np.ndarray, w: np.ndarray, r: np.ndarray, variance: float, together: float
+    J: np.ndarray,
+    outward: np.ndarray,
+    w: np.ndarray,
+    r: np.ndarray,
+    inverse: np.ndarray,
+    variance: float,
+    together: float,
 ) -> np.ndarray:
     """What ranges that are all too long or too short by one length add to a pose's covariance (6, 6).
 
     The biases are parameters that the pose was found without (Schmidt's consider parameters): J (6, N) and outward
     (2, N; of source and target) are the residuals' derivatives. How large they are the residuals tell, where surfaces
-    face each other, as both sides of a street; where they don't, no more than BIAS is known. variance: of a residual;
-    together: how many of them are one observation.
+    face each other, as both sides of a street; where they don't, no more than BIAS is known. inverse: (6, 6) of Σ w J
+    Jᵀ; variance: of a residual; together: how many of them are one observation.
     """
     cross = (J * w) @ outward.T
-    to_pose = pseudo_inverse((J * w) @ J.T) @ cross
+    to_pose = inverse @ cross
     known = (outward * w) @ outward.T - cross.T @ to_pose
     pull = outward @ (w * r) - to_pose.T @ (J @ (w * r))
     spread = np.linalg.inv(known / together + np.eye(2) / BIAS**2)  # in units of the residuals' variance
