@@ -52,7 +52,10 @@ def message_of(store: Any, rows: np.ndarray, stamp: int, ros1: bool, height: int
     layout = rows.dtype
     fields = [
         types["sensor_msgs/msg/PointField"](
-            name=name, offset=int(layout.fields[name][1]), datatype=DATATYPES[layout[name].str[1:]], count=1
+            name=name,
+            offset=int(layout.fields[name][1]),
+            datatype=DATATYPES[layout[name].base.str[1:]],
+            count=int(np.prod(layout[name].shape, dtype=int)),
         )
         for name in layout.names
     ]

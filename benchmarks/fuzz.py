@@ -17,6 +17,7 @@ import json
 import os
 import random
 import resource
+import signal
 import struct
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io import read_cloud
 
 SECONDS, MEGABYTES = 2.0, 500  # of the processor; of memory beyond what the process has
+HANGS = 30.0  # s of the processor after which a process that still reads one file is ended
 LARGEST = 1_000_000  # bytes of a malformed file
 TEXT = (".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".off", ".obj")
 NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 62, (1 << 64) - 1)
@@ -212,6 +214,7 @@ def work(seed: int, count: int, minutes: float | None, folder: Path) -> None:
         path = folder / f"{number}-{example.name}"
         path.write_bytes(data)
         (folder / "last").write_text(path.name)
+        signal.setitimer(signal.ITIMER_PROF, HANGS)  # ends the process by SIGPROF, whatever it is in
         wrong = said_wrong(path)
         if (news := errors.news()) and wrong is None:
             wrong = f"on stderr: {news[:300]!r}"
@@ -243,7 +246,9 @@ def run(seed: int, count: int, minutes: float | None, folder: Path) -> tuple[int
         if process.returncode == 0:
             return total + rows[-1]["executions"], findings
         last = (folder / "last").read_text() if (folder / "last").exists() else ""
-        findings.append({"file": last, "wrong": f"the process ended with {process.returncode}"})
+        hung = process.returncode == -signal.SIGPROF
+        how = f"more than {HANGS:.0f} s" if hung else f"the process ended with {process.returncode}"
+        findings.append({"file": last, "wrong": how})
         after = int(last.split("-")[0]) + 1 if last else seed + count
         total, count, seed = total + after - seed, count - (after - seed), after
     return total, findings

@@ -20,7 +20,7 @@ RIGHT_SHIFT = 0.02  # of the target's largest extent: the shift of its middle, a
 RIGHT_SCALE = 0.02  # share by which the scale is off, at most: what moves the border by half of RIGHT_SHIFT
 EXPERIMENTS = {
     "cross-source": Experiment(
-        "cross-source", "strength of the photogrammetric defects", tuple((v, v) for v in (0.5, 1.0, 2.0)),
+        "cross-source", "strength of the defects", tuple((v, v) for v in (0.5, 1.0, 2.0)),
         (("success", "share right"), ("scale_median", "median error of the scale"),
          ("aligned_right", "share aligned and right"), ("aligned_wrong", "share aligned and wrong")),
     )

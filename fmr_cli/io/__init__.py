@@ -14,7 +14,7 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.addresses import address_of, local, shown
-from fmr_cli.io.files import atomic_write, check_readable, reason
+from fmr_cli.io.files import atomic_write, check_readable, reason, shortened
 from fmr_cli.io.mesh import Mesh
 from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name, topic_of
 from fmr_cli.io.stream import CloudStream, Wanted, ahead, collect, stream_of
@@ -258,7 +258,7 @@ def naming(path: Path) -> Iterator[None]:
         with np.errstate(all="ignore"):
             yield
     except CloudFileError as error:
-        raise CloudFileError(f"{shown(path)}: {error}") from error
+        raise CloudFileError(f"{shown(path)}: {shortened(str(error))}") from error
     except MemoryError as error:
         raise CloudFileError(f"{shown(path)}: does not fit into this machine's memory, thin it out first") from error
     except Exception as error:

@@ -110,10 +110,10 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
         raise CloudFileError(f"has no clouds on {bag.topic}")
     parts = [ScanPart(seconds(stamp), np.eye(4), 0) for stamp in bag.stamps]
     chosen = choose(parts, part)
-    kinds: dict[str, np.dtype] | None = None
+    kinds: dict[str, tuple[np.dtype, tuple[int, ...]]] | None = None
     for index in chosen:
         cloud = bag.cloud(index, wanted.attributes)
-        found = {name: values.dtype for name, values in cloud.attributes.items()}
+        found = {name: (values.dtype, values.shape[1:]) for name, values in cloud.attributes.items()}
         if kinds is not None and found != kinds:
             raise CloudFileError(f"has clouds of other fields from {parts[index].name} on: read them one by one")
         kinds = found

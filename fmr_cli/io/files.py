@@ -15,6 +15,7 @@ from fmr_cli.errors import CloudFileError
 
 TEMPORARY = re.compile(r"\..*\.(?P<host>\w+)-(?P<pid>[0-9]{1,9})-[0-9a-f]{8}\.tmp(\..*)?")  # a temporary's name
 DAY = 86_400  # seconds
+LONGEST_MESSAGE = 550  # characters, but for the file's name
 
 
 def check_readable(path: Path) -> int:
@@ -108,6 +109,11 @@ def is_running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0] not in "ZX"
     except (OSError, IndexError):
         return True
+
+
+def shortened(text: str) -> str:
+    """A message with its middle left out where what it quotes of a damaged file makes it longer than a reader bears."""
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[: LONGEST_MESSAGE - 200]} ... {text[-150:]}"
 
 
 def reason(error: BaseException) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -26,6 +27,9 @@ from fmr_cli.io.fields import (
     to_cloud,
 )
 from fmr_cli.io.stream import CHUNK, CloudStream, Column, Wanted
+
+# Said of files that Python 2 has written, which are read all the same
+warnings.filterwarnings("ignore", "Reading `.npy` or `.npz` file required additional header parsing", UserWarning)
 
 DEFLATE_LIMIT = 1100  # zip cannot shrink data more than this many times
 OWN = ("points", "crs", "sensor_origin", "file")  # names an attribute in an NPZ cannot have

@@ -29,7 +29,7 @@ MISSING = {"", "nan", "+nan", "-nan", "na", "n/a", "#n/a", "null", "none", "-", 
 END_OF_FILE = "\x1a"  # of DOS
 MINUS = "\u2212"  # of typesetters
 INFINITE = {"1.#inf": np.inf, "-1.#inf": -np.inf}
-FORTRAN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[dD][+-]?\d+")
+FORTRAN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)[dD][+-]?\d+")
 # 1 234.5, 1'234.5; 1,234,567; 1,234.5; 1.234,5; 1.234.567
 THOUSANDS = re.compile(
     r"[+-]?\d{1,3}([ '\u00a0\u2019\u202f]\d{3})+([.,]\d*)?|[+-]?\d{1,3}(,\d{3}){2,}"

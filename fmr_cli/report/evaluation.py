@@ -18,6 +18,7 @@ from fmr_cli.report.plots import Series, binomial
 
 SHARES = ("success", "aligned_right", "aligned_wrong")  # measures that are shares of the pairs
 EXACT = 1e-4  # degrees, sizes and times the limit: what is below is as good as none, and would squeeze all else
+AT_ENDS = 3  # lines whose names stand at their ends; those of more stand above the panels
 TICKS = (0, 1, 2, 5, 10, 20, 50, 100, 180)  # degrees, on an axis that is linear up to 1 and logarithmic beyond
 
 
@@ -124,9 +125,11 @@ def plot(path: Path, experiment: Experiment[Any], rows: list[Row]) -> None:
                 axes.set_ylim(-0.03, 1.03)
             elif name != "scale_median":
                 axes.set_yscale("log")
-            plots.curves(axes, series(rows, name), dodge=0.006)
+            lines = series(rows, name)
+            plots.curves(axes, lines, dodge=0.006, named=len(lines) <= AT_ENDS)
             if axes.get_yscale() == "log":
                 axes.set_ylim(bottom=max(axes.get_ylim()[0], EXACT))
+        names_of_many(figure, rows)
 
 
 def plot_solver(path: Path, experiment: Experiment[Any], rows: list[Row]) -> None:
@@ -137,9 +140,18 @@ def plot_solver(path: Path, experiment: Experiment[Any], rows: list[Row]) -> Non
         degrees.set(xlabel=experiment.axis, ylabel="median rotation error, deg")
         degrees.set_yscale("symlog", linthresh=1)
         degrees.set_yticks(TICKS, map(str, TICKS))
-        plots.curves(share, series(rows, "success"), dodge=0.006)
+        named = len(series(rows, "success")) <= AT_ENDS
+        plots.curves(share, series(rows, "success"), dodge=0.006, named=named)
         degrees.set_ylim(-0.1, 1.15 * max(1.0, *(r.rotation_median for r in rows)))
-        plots.curves(degrees, series(rows, "rotation_median"), dodge=0.006)
+        plots.curves(degrees, series(rows, "rotation_median"), dodge=0.006, named=named)
+        names_of_many(figure, rows)
+
+
+def names_of_many(figure: Any, rows: list[Row]) -> None:
+    """The names of more lines than find room at their ends."""
+    names = [line.label for line in series(rows, "rotation_median")]
+    if len(names) > AT_ENDS:
+        plots.names_above(figure, names)
 
 
 def plot_maps(path: Path, maps: dict[int, tuple[Tensor, Tensor]]) -> None:

@@ -31,6 +31,7 @@ STYLE = {
     "ytick.minor.size": 0, "axes.titlelocation": "left", "svg.fonttype": "none", "savefig.dpi": 220,
 }  # fmt: skip
 NORMAL = 1.96  # deviations on either side of 95 % of a normal distribution
+ABREAST = 90, 5  # letters in one line of names above the panels; of a name's marker and the gap after it
 LINE = 1.25  # times the font's size: how far labels stand apart
 
 
@@ -76,8 +77,8 @@ def look(number: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def curves(axes: Any, series: Sequence[Series], dodge: float = 0.0) -> None:
-    """Lines with markers, their intervals as bars, and each one's name at its end.
+def curves(axes: Any, series: Sequence[Series], dodge: float = 0.0, named: bool = True) -> None:
+    """Lines with markers, their intervals as bars, and each one's name at its end, if ``named``.
 
     dodge: by how much of the axis' length neighbours stand beside each other, so that bars and markers don't hide.
     """
@@ -89,7 +90,10 @@ def curves(axes: Any, series: Sequence[Series], dodge: float = 0.0) -> None:
         axes.plot(x, s.y, **look(number))
         if s.low is not None and s.high is not None:
             axes.vlines(x, s.low, s.high, color=COLORS[number % len(COLORS)], linewidth=0.9, zorder=2)
-    end_labels(axes, [(number, s.label, float(s.x[-1]), float(s.y[-1])) for number, s in enumerate(series) if len(s.x)])
+    if named:
+        end_labels(
+            axes, [(number, s.label, float(s.x[-1]), float(s.y[-1])) for number, s in enumerate(series) if len(s.x)]
+        )
 
 
 def end_labels(axes: Any, ends: Sequence[tuple[int, str, float, float]]) -> None:
@@ -150,12 +154,13 @@ def dots(axes: Any, rows: Sequence[str], series: Sequence[Series]) -> None:
 
 
 def names_above(figure: Any, labels: Sequence[str], lines: bool = False) -> None:
-    """The series' names in their colours with their markers, or lines, in one line above all panels."""
+    """The series' names in their colours with their markers, or lines, above all panels."""
     from matplotlib.lines import Line2D
 
     without = {"marker": ""} if lines else {"linestyle": ""}
     handles = [Line2D([], [], **{**look(n), **without}, label=label) for n, label in enumerate(labels)]
-    figure.legend(handles=handles, loc="outside upper left", ncols=len(labels), frameon=False, labelcolor="linecolor",
+    columns = max(ABREAST[0] // (max(map(len, labels)) + ABREAST[1]), 1)
+    figure.legend(handles=handles, loc="outside upper left", ncols=columns, frameon=False, labelcolor="linecolor",
                   handletextpad=0.2, columnspacing=1.2)  # fmt: skip
 
 

@@ -46,6 +46,15 @@ def test_each_cloud_is_a_scan(tmp_path: Path, kind: str, layout: np.dtype) -> No
     assert np.array_equal(read_cloud(f"{bag}#1700000000.100000000").points, given[1])
 
 
+def test_clouds_whose_fields_have_other_widths(tmp_path: Path) -> None:
+    """Found by the fuzzer: an attribute of one value in one cloud, of two in the next."""
+    (points,) = scans(1)
+    rows = [np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("a", "f4", more)]) for more in ((), (2,))]
+    bag = write_bag(tmp_path / "a.mcap", {"/lidar": rows})
+    with pytest.raises(CloudFileError, match=r"has clouds of other fields from 1700000000\.1"):
+        read_cloud(bag)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_several_topics_are_told_apart(tmp_path: Path, kind: str) -> None:
     first, second = scans(2)
