@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from fmr_cli.errors import FmrError
 from fmr_cli.evaluation.open3d_import import open3d
@@ -84,7 +85,6 @@ def gicp(
 def lm_icp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Levenberg-Marquardt on the distances of all source points to the target (Fitzgibbon 2003), by scipy."""
     from scipy.optimize import least_squares
-    from scipy.spatial import cKDTree
     from scipy.spatial.transform import Rotation
 
     tree = cKDTree(target)
@@ -115,7 +115,18 @@ def missing(package: str) -> str | None:
     return None if importlib.util.find_spec(package) else f"{package} is not installed"
 
 
+SPACINGS = 2.0  # of the points, that an edge spans at least, so that a surface fills its voxels, as `fmr align` has it
+
 Voxel = Callable[[np.ndarray, np.ndarray], float]  # of source and target: the edge of the grid that suits them
+
+
+def filled(voxel: float, source: np.ndarray, target: np.ndarray) -> float:
+    """The edge ``voxel``, or the finest one that the points of both clouds fill, where that is coarser.
+
+    On a finer grid there are no neighbours to describe a point by, and KISS-Matcher ends the process.
+    """
+    spacing = max(float(np.median(cKDTree(cloud).query(cloud, 2)[0][:, 1])) for cloud in (source, target))
+    return max(voxel, SPACINGS * spacing)
 
 
 def global_baselines(voxel: float) -> tuple[dict[str, Baseline], list[str]]:

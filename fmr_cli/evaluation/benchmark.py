@@ -11,7 +11,7 @@ import numpy as np
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import FmrError
-from fmr_cli.evaluation.baselines import Baseline, gicp, global_baselines_at, then_gicp
+from fmr_cli.evaluation.baselines import Baseline, filled, gicp, global_baselines_at, then_gicp
 from fmr_cli.evaluation.datasets.pair import CorrespondenceRmse, DataSet, Loaded, Pair, correspondence_rmse, errors
 from fmr_cli.feature_metric.numpy_solver import NumpySolver
 from fmr_cli.geometry.frames import Frame, leave_frames
@@ -20,7 +20,7 @@ from fmr_cli.io.files import reason
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import align
 
-GRID = 50  # edges of the baselines' grid across the target, where a data set has no usual one
+GRID = 50  # edges of the baselines' grid across the target, fewer of a sparse one, where a data set has no usual one
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def methods(
     if baselines:
 
         def voxel(source: np.ndarray, target: np.ndarray) -> float:
-            return dataset.voxel or float(np.ptp(target, axis=0).max()) / GRID
+            return dataset.voxel or filled(float(np.ptp(target, axis=0).max()) / GRID, source, target)
 
         starts, missing = global_baselines_at(voxel)
         found |= {

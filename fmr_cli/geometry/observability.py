@@ -19,6 +19,7 @@ BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated,
 BENDS = 8.0  # independent parts of a scan that is bent or drifted as a whole: half an extent each
 # Counted as left of a direction without a block: without the one block that alone holds it, nothing would be.
 LEFT = 1e-3
+BIAS = 1.0  # residuals' sigmas: of a range bias, beforehand; sensors' data sheets give accuracy and noise of one size
 LEAST_BLOCKS = 8  # fewer say nothing about the scatter of their sums
 
 
@@ -47,6 +48,7 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     there are BENDS.
     """
     seen, misfits = [], []
+    centres = transform_points(T_target_source, source.points.mean(0)[None])[0], target.points.mean(0)
     back = np.linalg.inv(T_target_source)
     for a, b, T, swapped in ((source, target, T_target_source, False), (target, source, back, True)):
         moved = transform_points(T, a.points)
@@ -59,12 +61,13 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
             x, y, n = transform_points(T_target_source, y), a.points[here], n @ T_target_source[:3, :3].T
         r, J = linearise(x, y, n, origin)
         scale2 = (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * b.edge) ** 2
-        seen.append(np.vstack([r, geman_mcclure(r * r, scale2), geman_mcclure_slope(r * r, scale2), J, y.T]))
+        outward = np.stack([outwards(x, n, centres[0]), -outwards(y, n, centres[1])])
+        seen.append(np.vstack([r, geman_mcclure(r * r, scale2), geman_mcclure_slope(r * r, scale2), J, y.T, outward]))
         misfits.append(NORMAL**2 * (np.median(np.abs(r)) ** 2 - np.median(b.unevenness[0][match[here]]) ** 2))
     if not seen:
         return Certainty(np.zeros((6, 6)), np.zeros((6, 6)))
     r, w, slope, *rows = np.hstack(seen)
-    J, y = np.stack(rows[:6]), np.stack(rows[6:], 1)
+    J, y, outward = np.stack(rows[:6]), np.stack(rows[6:9], 1), np.stack(rows[9:])
     A = normal_equations(J, r, w)[0]
     variance = max(float(w @ (r * r) / max(w.sum(), 1e-12)), (1e-6 * target.edge) ** 2)
     units = np.sqrt(np.maximum(np.diag(A), 1e-300))  # radians and lengths compare once each is divided by its own
@@ -72,11 +75,43 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     inverse = pseudo_inverse(A / np.outer(units, units))
     covariance = inverse * w.sum() * max(sum(misfits), 0.0) / 2 / BENDS
     block, index = np.unique(voxel_keys(y, BLOCK * target.edge), return_inverse=True)
+    covariance += range_bias(J, outward, w, r, inverse, variance, len(r) / len(block))
     if len(block) >= LEAST_BLOCKS:
         covariance += sandwich(J, w * r, slope, index)
     else:
         covariance += inverse * variance
     return Certainty(A / 2 / variance, covariance / np.outer(units, units))
+
+
+def outwards(points: np.ndarray, normals: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """How far points (N, 3) move along their normals where all move one unit away from a scan's centre (3,)."""
+    away = points - centre
+    return np.einsum("ni,ni->n", away, normals) / np.maximum(np.linalg.norm(away, axis=1), 1e-300)
+
+
+def range_bias(
+    J: np.ndarray,
+    outward: np.ndarray,
+    w: np.ndarray,
+    r: np.ndarray,
+    inverse: np.ndarray,
+    variance: float,
+    together: float,
+) -> np.ndarray:
+    """What ranges that are all too long or too short by one length add to a pose's covariance (6, 6).
+
+    The biases are parameters that the pose was found without (Schmidt's consider parameters): J (6, N) and outward
+    (2, N; of source and target) are the residuals' derivatives. How large they are the residuals tell, where surfaces
+    face each other, as both sides of a street; where they don't, no more than BIAS is known. inverse: (6, 6) of Σ w J
+    Jᵀ; variance: of a residual; together: how many of them are one observation.
+    """
+    cross = (J * w) @ outward.T
+    to_pose = inverse @ cross
+    known = (outward * w) @ outward.T - cross.T @ to_pose
+    pull = outward @ (w * r) - to_pose.T @ (J @ (w * r))
+    spread = np.linalg.inv(known / together + np.eye(2) / BIAS**2)  # in units of the residuals' variance
+    bias = spread @ pull / together
+    return to_pose @ (variance * spread + np.outer(bias, bias)) @ to_pose.T
 
 
 def sandwich(J: np.ndarray, pull: np.ndarray, slope: np.ndarray, block: np.ndarray) -> np.ndarray:

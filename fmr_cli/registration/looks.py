@@ -54,8 +54,7 @@ def further(
                 consider(judge, features(seen, time), time)
             if judge.sure(enough):
                 return judge
-    likely = bool(judge.candidates) and judge.best.support >= LIKELY
-    if options.init == "search" or (options.init == "auto" and not likely and may_overlap_fully(pair)):
+    if options.init == "search" or (options.init == "auto" and not likely(judge) and may_overlap_fully(pair)):
         with time.stage("search"):
             found = hypotheses.from_search(pair)
         consider(judge, found, time)
@@ -97,7 +96,7 @@ def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch) -> None:
             if hypothesis.score >= WORTH * ranked[0].score and not judge.knows(hypothesis.T_target_source):
                 judge_refined(judge, hypothesis)
     with time.stage("rivals"):
-        if judge.candidates and judge.best.support >= LIKELY:  # what is not has no need of rivals
+        if likely(judge):  # what is not has no need of rivals
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
             for hypothesis in rivals:
@@ -111,6 +110,11 @@ def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
     if judge.pair.allowed(T):
         judge.consider(T, hypothesis.start, hypothesis.errors)
         log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
+
+
+def likely(judge: Judge) -> bool:
+    """Whether the best pose would be called right if it were alone."""
+    return bool(judge.candidates) and judge.best.support >= LIKELY
 
 
 def may_overlap_fully(pair: Pair) -> bool:

@@ -19,7 +19,7 @@ from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, mirror, places, refinement
 from fmr_cli.registration.confidence import LIKELY, Candidate, Judge
-from fmr_cli.registration.looks import FIRST, FURTHER, SURE, at_once, consider, features
+from fmr_cli.registration.looks import FIRST, FURTHER, SURE, at_once, consider, features, likely
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared, check_systems
@@ -62,7 +62,7 @@ def align(
         return found
     fits = None
     if aligned or (hints and not options.allow_mirror):
-        fits = mirror_look(source, target, options)
+        fits = mirror_look(source, target, options, thorough=aligned)
     if aligned:
         found = mirror.weighed(found, fits)
     if found.status == "aligned":
@@ -76,8 +76,14 @@ def align(
     return found
 
 
-def mirror_look(source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options) -> Candidate | None:
-    """How the mirror image of the source fits the target, where a quick look is sure that it does."""
+def mirror_look(
+    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, thorough: bool = True
+) -> Candidate | None:
+    """How the mirror image of the source fits the target, where a quick look is sure that it does.
+
+    Unless thorough, fine voxels are looked at only where coarse ones make it likely: most pairs that are not aligned
+    fit in no way, mirrored or not, and the fine look took a quarter of their time.
+    """
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):
         image = mirror.image(source, options.seed)
@@ -87,6 +93,8 @@ def mirror_look(source: PointCloud | Prepared, target: PointCloud | Prepared, op
             consider(judge, features(judge.pair, time), time)
             if judge.sure(SURE):
                 return judge.best
+            if not (thorough or likely(judge)):
+                return None
     return None
 
 

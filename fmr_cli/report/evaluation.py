@@ -17,6 +17,7 @@ from fmr_cli.report import plots
 from fmr_cli.report.plots import Series, binomial
 
 SHARES = ("success", "aligned_right", "aligned_wrong")  # measures that are shares of the pairs
+EXACT = 1e-4  # degrees, sizes and times the limit: what is below is as good as none, and would squeeze all else
 TICKS = (0, 1, 2, 5, 10, 20, 50, 100, 180)  # degrees, on an axis that is linear up to 1 and logarithmic beyond
 
 
@@ -124,6 +125,8 @@ def plot(path: Path, experiment: Experiment[Any], rows: list[Row]) -> None:
             elif name != "scale_median":
                 axes.set_yscale("log")
             plots.curves(axes, series(rows, name), dodge=0.006)
+            if axes.get_yscale() == "log":
+                axes.set_ylim(bottom=max(axes.get_ylim()[0], EXACT))
 
 
 def plot_solver(path: Path, experiment: Experiment[Any], rows: list[Row]) -> None:

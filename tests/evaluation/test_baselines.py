@@ -40,6 +40,23 @@ def test_global_baselines_find_any_motion(room_scans, name):
     assert pose_error(there[name](room_scans[0], target), T)[0] < 3
 
 
+@pytest.mark.parametrize("name", list(baselines.GLOBAL))
+def test_a_sparse_cloud_has_a_grid_that_it_fills(name):
+    """On twenty points a grid of a fiftieth of the extent has no neighbours; KISS-Matcher would end the process."""
+    rng = np.random.default_rng(0)
+    source, target = rng.uniform(-0.5, 0.5, (2, 20, 3))
+    there, missing = baselines.global_baselines_at(partial(baselines.filled, 0.02))
+    if name not in there:
+        pytest.skip("; ".join(missing))
+    assert there[name](source, target).shape == (4, 4)
+
+
+def test_a_dense_cloud_keeps_the_edge_and_a_thinned_one_does_not():
+    grid = np.stack(np.meshgrid(*[np.arange(10.0)] * 3), -1).reshape(-1, 3)
+    assert baselines.filled(3.0, grid, grid) == 3.0
+    assert baselines.filled(3.0, 5 * grid, grid) == 10.0
+
+
 @pytest.mark.parametrize(
     ("error", "said"),
     [
