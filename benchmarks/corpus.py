@@ -154,6 +154,10 @@ def ply_examples() -> list[Example]:
         Example("PLY: ascii", "ascii.ply", ply("ascii", xyz, text)),
         Example("PLY: ascii", "doubles.ply", ply("ascii", [f"double {axis}" for axis in "xyz"], text)),
         Example("PLY: ascii", "commas.ply", ply("ascii", xyz, lines(",").encode())),
+        Example("PLY: ascii", "comma_blank.ply", ply("ascii", xyz, lines(", ").encode())),
+        Example("PLY: ascii", "semicolons.ply", ply("ascii", xyz, lines(";").encode())),
+        Example("PLY: ascii", "capitals.ply", ply("ascii", xyz, b"").upper().replace(b" X", b" x") + text),
+        Example("PLY: ascii", "points.ply", ply("ascii", xyz, text).replace(b"element vertex", b"element points")),
         Example("PLY: binary, both byte orders", "little.ply", ply("binary_little_endian", xyz, little)),
         Example("PLY: binary, both byte orders", "big.ply", ply("binary_big_endian", xyz, big)),
         Example("PLY: line ends LF, CR LF, CR", "cr.ply", ply("ascii", xyz, text).replace(b"\n", b"\r")),
@@ -198,6 +202,7 @@ def pcd_examples() -> list[Example]:
     return [
         Example("PCD: ascii", "ascii.pcd", pcd(xyz, sizes, kinds, "ascii", text)),
         Example("PCD: ascii", "commas.pcd", pcd(xyz, sizes, kinds, "ascii", lines(",").encode())),
+        Example("PCD: ascii", "comma_blank.pcd", pcd(xyz, sizes, kinds, "ascii", lines(", ").encode())),
         Example("PCD: binary", "binary.pcd", pcd(xyz, sizes, kinds, "binary", body)),
         Example("PCD: binary_compressed", "packed.pcd",
                 pcd("x y z i", "4 4 4 4", "F F F F", "binary_compressed", compressed), ("intensity",)),
@@ -233,12 +238,14 @@ def numpy_examples() -> list[Example]:
         Example("NPY: (N, 3), (3, N), images, any type", "rows.npy", npy(P)),
         Example("NPY: (N, 3), (3, N), images, any type", "columns.npy", npy(P.T)),
         Example("NPY: (N, 3), (3, N), images, any type", "image.npy", npy(P.reshape(6, 10, 3))),
+        Example("NPY: (N, 3), (3, N), images, any type", "batch.npy", npy(P.T[None])),
         Example("NPY: (N, 3), (3, N), images, any type", "big.npy", npy(P.astype(">f4"))),
         Example("NPY: colours, normals, intensity behind", "wide.npy", npy(np.hstack([P, RGB])), COLORS),
         Example("NPY: records", "records.npy", npy(named), ("intensity",)),
         Example("NPZ: points and attributes", "own.npz", npz(points=P, intensity=I), ("intensity",)),
         Example("NPZ: points and attributes", "keys.npz", npz(xyz=P.astype("f4"), rgb=RGB, normals=N, pose=np.eye(4)),
                 (*COLORS, *NORMALS), ("array 'pose'",)),
+        Example("NPZ: points and attributes", "capitals.npz", npz(XYZ=P, RGB=RGB), COLORS),
         Example("NPZ: points and attributes", "axes.npz", npz(x=P[:, 0], y=P[:, 1], z=P[:, 2], t=I), ("t",)),
     ]  # fmt: skip
 

@@ -34,8 +34,8 @@ warnings.filterwarnings("ignore", "Reading `.npy` or `.npz` file required additi
 DEFLATE_LIMIT = 1100  # zip cannot shrink data more than this many times
 OWN = ("points", "crs", "sensor_origin", "file")  # names an attribute in an NPZ cannot have
 # What others call the array of coordinates; the first that is there
-KEYS = ("points", "xyz", "pts", "pos", "positions", "coords", "coordinates", "vertices", "point_cloud", "pointcloud",
-        "pcd", "pc", "cloud", "data", "arr_0")  # fmt: skip
+KEYS = ("points", "xyz", "pts", "pos", "positions", "coords", "coordinates", "vertices", "verts", "point_cloud",
+        "pointcloud", "pcd", "pc", "cloud", "data", "arr_0")  # fmt: skip
 WIDEST = 16  # columns a point may have that have no names
 HEAD = 200  # rows that are looked at to tell poses from points
 FEWEST = 10  # points of a cloud: an array of fewer rows and more columns holds the points side by side
@@ -73,6 +73,8 @@ def clouds_of(array: np.ndarray, attributes: bool) -> Iterator[PointCloud]:
 
 def as_rows(array: np.ndarray) -> np.ndarray:
     """(N, 3 + k) of whatever shape points are held in. Raises CloudFileError naming what else it may be."""
+    if array.ndim > 2 and array.shape[0] == 1:  # a batch of one cloud
+        return as_rows(array[0])
     shape = array.shape
     if array.dtype.kind not in "biuf":
         raise CloudFileError(f"holds an array of {array.dtype}, points need numbers")
@@ -109,12 +111,15 @@ def read_npz(path: Path, attributes: bool) -> Iterator[PointCloud]:
                 file.seek(0)
                 return np.lib.format.read_array(file, allow_pickle=False)
 
-        key = next((key for key in KEYS if key in entries), None)
+        small = {name.lower(): name for name in reversed(entries)}
+        key = next((small[key] for key in KEYS if key in small), None)
         key = next(iter(entries)) if key is None and len(entries) == 1 else key
         axes = coordinates(entries) if key is None else None
         refuse_degrees(entries)
         if key is None and axes is None:
-            raise CloudFileError(f"has no array 'points' (N, 3) among {', '.join(entries) or 'nothing'}")
+            raise CloudFileError(
+                f"has no array 'points' (N, 3) among {', '.join(entries) or 'nothing'}: save the one you mean as .npy"
+            )
         if key is not None:
             cloud = joined_up(list(clouds_of(load(key), attributes)))
         else:

@@ -31,6 +31,7 @@ TYPES = {
 NAMES = {TYPES[name]: name for name in ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")}
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 KEYWORDS = ("ply", "format", "comment", "obj_info", "element", "property", "end_header")
+ELEMENTS = {**dict.fromkeys(("vertex", "vertices", "point", "points"), "vertex"), "face": "face", "faces": "face"}
 LONGEST_HEADER = 1 << 20
 
 
@@ -210,11 +211,11 @@ def read_header(file: BinaryIO) -> Header:
                 case ["format", kind, *_]:
                     order = ORDERS[kind.lower()]
                 case ["element", name, count] if count.isascii() and count.isdigit():
-                    elements.append(Element(name, int(count)))
-                case ["property", "list", count_type, kind, name] if TYPES[count_type][0] in "iu":
-                    elements[-1].properties.append(Property(name, TYPES[kind], TYPES[count_type]))
+                    elements.append(Element(ELEMENTS.get(name.lower(), name), int(count)))
+                case ["property", "list" | "LIST", count_type, kind, name] if TYPES[count_type.lower()][0] in "iu":
+                    elements[-1].properties.append(Property(name, TYPES[kind.lower()], TYPES[count_type.lower()]))
                 case ["property", kind, name]:
-                    elements[-1].properties.append(Property(name, TYPES[kind]))
+                    elements[-1].properties.append(Property(name, TYPES[kind.lower()]))
                 case _ if in_comment and keyword not in KEYWORDS:
                     continue  # a comment of several lines
                 case _:

@@ -33,6 +33,7 @@ PTS = ("intensity", *COLORS)  # what a PTS line may hold after x y z, in that or
 PREAMBLE = 30  # lines before the names, at most
 FLAT = 100  # times as high as wide: a pole, or longitude and latitude with a height in metres
 DEGREES = "its x and y may be longitude and latitude, and degrees are no lengths: if so, project it first, to UTM say"
+BRACKETED = re.compile(r"\s*[\[({]\s*([\[({\"]|[+-]?[.\d])")  # JSON, Python, WKT: a list of points and no table
 SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
 
@@ -114,6 +115,10 @@ def find_table(head: Rows) -> Table:
         head.numbers.pop(0)
     for i in reversed([i for i, line in enumerate(head.lines) if line.lstrip().startswith(COMMENTS)]):
         del head.lines[i], head.numbers[i]
+    if head.lines and BRACKETED.match(head.lines[0]):
+        raise CloudFileError(
+            f"line {head.numbers[0]}: has brackets around its points, as JSON has: write a point a line, x y z alone"
+        )
     promised = None
     if len(head.lines) > 1 and head.lines[0].strip().isdecimal():
         promised = int(head.lines.pop(0))

@@ -42,7 +42,7 @@ BAD = {
     "short-text.ply": (PLY_TEXT.format(4).encode() + b"1.000000 2.000000 3.000000\n" * 3, "promises 4"),
     "negative.ply": (PLY.format(-5).encode() + bytes(2400), "line 3 is 'element vertex -5'"),
     "garbled.ply": (PLY.format("1e3").encode() + bytes(2400), "line 3"),
-    "no-vertex.ply": (PLY.format(9).replace("vertex", "point").encode() + bytes(2400), "no element 'vertex'"),
+    "no-vertex.ply": (PLY.format(9).replace("vertex", "camera").encode() + bytes(2400), "no element 'vertex'"),
     "no-z.ply": (PLY.format(9).replace("double z", "double w").encode() + bytes(2400), "has no z"),
     "no-end.ply": (PLY.format(9)[:-11].encode(), "without an end"),
     "list.ply": (FACES.format(1).encode() + bytes(24) + struct.pack("<iii", 10**9, 0, 0), "'face' lists"),
