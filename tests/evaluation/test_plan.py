@@ -29,6 +29,7 @@ def without_seconds(rows):
     return [replace(row, seconds=0.0) for several in rows for row in several]
 
 
+@pytest.mark.slow
 def test_a_data_set_by_this_process_and_by_two_others(pairs):
     made = OnDataset("pairs", (pairs,), Compared(align=False, plain=False))
     here, there = (without_seconds(made.run(team)) for team in (Here(), Processes(2)))

@@ -169,6 +169,10 @@ def test_what_may_be_degrees_is_said(tmp_path: Path, named: bool) -> None:
         np.savetxt(tmp_path / "a.csv", points, delimiter=",", fmt="%.8f", header=head, comments="")
         (note,) = read_cloud(tmp_path / "a.csv").notes or ("",)
         assert ("longitude and latitude" in note) == said
-    np.savetxt(tmp_path / "a.csv", degrees, delimiter=",", fmt="%.8f", header=head, comments="")
+
+
+def test_align_says_what_may_be_degrees(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0, 1, (300, 3)) * [1e-3, 1e-3, 12] + [9.1829, 48.7758, 240]
+    np.savetxt(tmp_path / "a.csv", points, delimiter=",", fmt="%.8f")
     done = command.here("align", "a.csv", "a.csv", "--init", "identity", cwd=tmp_path)
     assert "warning: a.csv: its x and y may be" in done.stderr

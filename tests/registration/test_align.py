@@ -352,7 +352,7 @@ def test_flat_and_tiny_clouds_end_in_a_result(room_scans: Scans) -> None:
 
 
 def test_a_flat_cloud_onto_itself_tells_what_it_does_not_determine() -> None:
-    flat = np.random.default_rng(1).uniform(0, 1, (4000, 3)) * [1, 1, 0]
+    flat = np.random.default_rng(1).uniform(0, 1, (1500, 3)) * [1, 1, 0]
     here = align(PointCloud(flat[::2]), PointCloud(flat[1::2]), Options(init="identity"))
     assert len(here.undetermined) == 3
     assert np.isfinite(here.covariance).all()
