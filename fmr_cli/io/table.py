@@ -201,8 +201,8 @@ def parse_slowly(rows: Rows, dtype: np.dtype, dialect: Dialect) -> np.ndarray:
     kinds = [dtype[name].kind for name in dtype.names or ()]
     for line, number in zip(rows.lines, rows.numbers, strict=True):
         cells = dialect.cells(line)
-        if dialect.delimiter is None and ("," in line or ";" in line):
-            cells = line.replace(",", " ").replace(";", " ").split()  # PLY and PCD with commas
+        if dialect.delimiter is None and not dialect.decimal_comma and ("," in line or ";" in line):
+            cells = line.replace(",", " ").replace(";", " ").split()  # PLY and PCD with commas or semicolons
         if 3 <= len(cells) == dialect.columns - 1 and dialect.delimiter is not None and dialect.used[-1] == len(cells):
             cells.append("")  # a last cell that is empty and whose delimiter an editor has cut off
         try:

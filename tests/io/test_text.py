@@ -31,6 +31,7 @@ DIALECTS = {
     "decimal-semicolon.csv": ("X;Y;Z;Intensity\n1,0;2,5;3;0,5\n-4;5;600,0;7,25\n", {"intensity": [0.5, 7.25]}),
     "decimal-tab.txt": ("1,0\t2,5\t3,0\n-4,0\t5,0\t600,0\n", {}),
     "decimal-blanks.txt": ("1,0 2,5 3,0\n-4,0 5,0 600,0\n", {}),
+    "decimal-blanks-fortran.txt": ("1,0 2,5 3,0\n-4,0 5,0 6,0D2\n", {}),  # numpy refuses it, cell by cell it is read
     "quotes.csv": ('"x","y","z","i"\n"1","2.5","3","9"\n"-4","5","600","8"\n', {"intensity": [9, 8]}),
     "units.csv": ("X [m],Y [m],Z [m],Intensity (counts)\n1,2.5,3,9\n-4,5,600,8\n", {"intensity": [9, 8]}),
     "units-blanks.txt": ("X [m] Y [m] Z [m] i\n1 2.5 3 9\n-4 5 600 8\n", {"intensity": [9, 8]}),
