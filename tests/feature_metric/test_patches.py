@@ -124,6 +124,6 @@ def test_both_jacobians_undo_a_motion_too_and_come_nearer_by_one_step(
         for both, found in off.items():
             fit = refine(layers, template, look, np.eye(4), 1, both=both)
             found.append(math.degrees(angle_between(fit.g[:3, :3], T[:3, :3])))
-    fit = refine(layers, template, look, np.eye(4), 15, both=True)  # from the farthest
-    assert math.degrees(angle_between(fit.g[:3, :3], T[:3, :3])) < 0.05
+        fit = refine(layers, template, look, np.eye(4), 15, both=True)
+        assert math.degrees(angle_between(fit.g[:3, :3], T[:3, :3])) < 0.05
     assert sum(off[True]) < sum(off[False])  # to second order

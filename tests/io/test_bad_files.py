@@ -176,7 +176,7 @@ rng = random.Random(1)
 for valid in sorted(Path(sys.argv[1]).iterdir()):
     data = valid.read_bytes()
     path = Path(sys.argv[2]) / valid.name
-    for _ in range(60):
+    for _ in range(120):
         damaged = bytearray(data[: rng.randrange(len(data))] if rng.random() < 0.3 else data)
         for _ in range(rng.choice([0, 1, 1, 3])):
             if damaged:

@@ -19,7 +19,6 @@ from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.registration.models import model
 from fmr_cli.synthetic import scenes
-from fmr_cli.training import scan_material
 from fmr_cli.training.local_views import PATCH_RADIUS, aliases
 from fmr_cli.training.loop import Trainer
 from fmr_cli.training.recipe import ScanRecipe
@@ -70,12 +69,12 @@ def files(room, tmp_path_factory) -> tuple[list[Scan], list[np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def found(files):
-    return register_scans(files[0][:3], list(range(3)), None, 12, 0)
+    return register_scans(files[0][:4], list(range(4)), None, 12, 0)
 
 
 def test_scans_register_themselves_and_every_pair_of_a_part_has_a_pose(files, found):
     poses = files[1]
-    assert len(found.pairs) >= 2
+    assert len(found.pairs) >= 4
     for pair in found.pairs:
         truth = poses[pair.target] @ np.linalg.inv(poses[pair.source])
         E = np.linalg.inv(truth) @ np.array(pair.T_target_source)
@@ -247,7 +246,6 @@ def finish(trainer: Trainer) -> list[str]:
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_in_its_second_round_goes_on_to_the_same_weights(tmp_path, files):
-    files = (files[0][:3], files[1])
     whole = trainer(files, tmp_path / "whole")
     notes = finish(whole)
     assert [n[:8] for n in notes] == ["round 1:", "round 2:"]
@@ -261,8 +259,7 @@ def test_a_run_that_is_killed_in_its_second_round_goes_on_to_the_same_weights(tm
     assert (tmp_path / "whole" / ROUNDS).read_text() == (tmp_path / "killed" / ROUNDS).read_text()
 
 
-def test_the_file_is_a_whole_model(tmp_path, files, found, monkeypatch):
-    monkeypatch.setattr(scan_material, "register_scans", lambda *_: found)  # of the same scans, by the same model
+def test_the_file_is_a_whole_model(tmp_path, files):
     run = trainer((files[0][:3], files[1]), tmp_path, rounds=1)
     finish(run)
     kept = model(tmp_path / "model.safetensors")
