@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from fmr_cli.errors import FmrError
 from fmr_cli.evaluation.open3d_import import open3d
+from fmr_cli.registration.prepared import SPACINGS
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -114,8 +115,6 @@ def missing(package: str) -> str | None:
         return None
     return None if importlib.util.find_spec(package) else f"{package} is not installed"
 
-
-SPACINGS = 2.0  # of the points, that an edge spans at least, so that a surface fills its voxels, as `fmr align` has it
 
 Voxel = Callable[[np.ndarray, np.ndarray], float]  # of source and target: the edge of the grid that suits them
 

@@ -111,8 +111,8 @@ def read_npz(path: Path, attributes: bool) -> Iterator[PointCloud]:
                 file.seek(0)
                 return np.lib.format.read_array(file, allow_pickle=False)
 
-        small = {name.lower(): name for name in reversed(entries)}
-        key = next((small[key] for key in KEYS if key in small), None)
+        named = {name.lower(): name for name in reversed(entries)}
+        key = next((named[key] for key in KEYS if key in named), None)
         key = next(iter(entries)) if key is None and len(entries) == 1 else key
         axes = coordinates(entries) if key is None else None
         refuse_degrees(entries)

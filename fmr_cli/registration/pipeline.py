@@ -82,7 +82,7 @@ def mirror_look(
     """How the mirror image of the source fits the target, where a quick look is sure that it does.
 
     Unless thorough, fine voxels are looked at only where coarse ones make it likely: most pairs that are not aligned
-    fit in no way, mirrored or not, and the fine look took a quarter of their time.
+    fit in no way, mirrored or not, and the fine look is several times as dear as the coarse one.
     """
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):

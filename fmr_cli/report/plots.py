@@ -31,7 +31,8 @@ STYLE = {
     "ytick.minor.size": 0, "axes.titlelocation": "left", "svg.fonttype": "none", "savefig.dpi": 220,
 }  # fmt: skip
 NORMAL = 1.96  # deviations on either side of 95 % of a normal distribution
-ABREAST = 90, 5  # letters in one line of names above the panels; of a name's marker and the gap after it
+ABREAST = 90  # letters in one line of names above the panels
+MARKER = 5  # of them, that a name's marker and the gap after it take
 LINE = 1.25  # times the font's size: how far labels stand apart
 
 
@@ -159,7 +160,7 @@ def names_above(figure: Any, labels: Sequence[str], lines: bool = False) -> None
 
     without = {"marker": ""} if lines else {"linestyle": ""}
     handles = [Line2D([], [], **{**look(n), **without}, label=label) for n, label in enumerate(labels)]
-    columns = max(ABREAST[0] // (max(map(len, labels)) + ABREAST[1]), 1)
+    columns = max(ABREAST // (max(map(len, labels)) + MARKER), 1)
     figure.legend(handles=handles, loc="outside upper left", ncols=columns, frameon=False, labelcolor="linecolor",
                   handletextpad=0.2, columnspacing=1.2)  # fmt: skip
 
