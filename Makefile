@@ -3,7 +3,8 @@
 # All make .venv from nothing but Python 3.11 or later (on Debian: apt install python3-venv); again, they are quick.
 PYTHON ?= python3
 BIN := .venv/bin
-INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e
+# Python compiles what it imports, the first time: a small part of what pip would take a minute for.
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e
 WORKERS ?= auto # of pytest; a test process takes about 0.7 GB
 
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal # runs of tests: what a file's tests share is made once
@@ -11,7 +12,7 @@ PYTEST = OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal # runs o
 # Tests start many processes: what the first one compiles, the others read, even where the environment says otherwise.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo lint test test-all coverage docs clean
+.PHONY: demo lint test test-all quick-tests all-tests coverage docs clean
 
 demo: .venv/installed
 	mkdir -p demo
@@ -24,10 +25,17 @@ lint: .venv/installed-for-tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: lint
+# Lint runs beside the tests: alone it would leave all cores but one idle.
+test: .venv/installed-for-tests
+	$(MAKE) --no-print-directory --jobs=2 lint quick-tests
+
+test-all: .venv/installed-for-tests
+	$(MAKE) --no-print-directory --jobs=2 lint all-tests
+
+quick-tests: .venv/installed-for-tests
 	$(PYTEST) -m "not slow"
 
-test-all: lint
+all-tests: .venv/installed-for-tests
 	$(PYTEST)
 
 coverage: .venv/installed-for-tests
@@ -36,15 +44,17 @@ coverage: .venv/installed-for-tests
 docs: .venv/installed-for-docs
 	$(BIN)/mkdocs build --strict
 
-.venv/installed: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/installed: pyproject.toml constraints.txt | .venv/bin/python
 	$(INSTALL) .
 	touch $@
 
 # Every extra: no test is skipped for want of a package.
-.venv/installed-for-tests: .venv/installed
+.venv/installed-for-tests: pyproject.toml constraints.txt | .venv/bin/python
 	$(INSTALL) '.[eval,report,e57,ros,crs,baselines,dask,docs,dev]'
-	touch $@
+	touch .venv/installed $@
 
 .venv/installed-for-docs: .venv/installed
 	$(INSTALL) '.[docs]'

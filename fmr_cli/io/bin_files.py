@@ -72,7 +72,8 @@ def record_of(columns: Iterable[str]) -> np.dtype:
     if not {*"xyz"} <= {*names} or len({*names}) < len(names):
         raise CloudFileError(f"{said} there must be one x, one y and one z, and each other name once")
     try:
-        return np.dtype([(name, np.dtype(kind or "f4").newbyteorder("<")) for name, _, kind in given])
+        fields = [(name, np.dtype(kind or "f4").newbyteorder("<")) for name, _, kind in given]
+        return np.dtype(fields)
     except TypeError as error:
         raise CloudFileError(f"{said} {error}; types are such as f4, f8, u1, u2, i4") from None
 

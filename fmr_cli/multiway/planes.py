@@ -10,7 +10,6 @@ only what the scans see through tells (``visibility``).
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import correlate
 
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.pose_error import angle_between
@@ -64,7 +63,7 @@ def profiles(points: np.ndarray, normals: np.ndarray, bin_width: float) -> list[
 def shifts(source: tuple[int, np.ndarray], target: tuple[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Scores, 1 where all planes meet, and shifts in bins: the best SHIFTS of them, no two next to each other."""
     (first, a), (other, b) = source, target
-    score = sum(correlate(y, x, "full", "direct") for x, y in zip(a, b, strict=True))
+    score = np.sum([np.correlate(y, x, "full") for x, y in zip(a, b, strict=True)], axis=0)
     score = score / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-12)
     padded = np.pad(score, 1, constant_values=-1)
     peaks = np.flatnonzero((score >= padded[:-2]) & (score > padded[2:]) & (score > 0))

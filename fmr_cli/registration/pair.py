@@ -162,8 +162,8 @@ class Pair:
 
     def same(self, a: np.ndarray, b: np.ndarray) -> bool:
         """Whether two poses are one, but for what a refinement moves."""
-        angle = angle_degrees(np.linalg.inv(a) @ b)
-        return bool(angle < DISTINCT_DEGREES and np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge)
+        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge  # asked first, since it is cheap
+        return bool(near) and angle_degrees(np.linalg.inv(a) @ b) < DISTINCT_DEGREES
 
     def allowed(self, T_target_source: np.ndarray) -> bool:
         """Whether a pose keeps to the options' ``max_angle`` and ``max_shift``."""

@@ -116,7 +116,7 @@ def test_a_constraint_holds_exactly(layers: Layers, body: np.ndarray, centres: n
 def test_both_jacobians_undo_a_motion_too_and_come_nearer_by_one_step(
     layers: Layers, body: np.ndarray, centres: np.ndarray
 ) -> None:
-    template = patch_template(layers, centres, balls(body), RADIUS)
+    template = patch_template(layers, centres[::2], balls(body), RADIUS)
     off = {False: [], True: []}
     for degrees in (2, 4, 8):
         T = motion(degrees, 0.01)

@@ -87,11 +87,11 @@ def test_a_wrong_link_does_no_harm_and_is_named(network, room, worst_error):
 
 @pytest.mark.slow
 def test_fixed_scans_stay_and_the_others_come_into_their_frame(room, worst_error):
-    clouds, truth = room
+    clouds, truth = (several[:3] for several in room)
     poses = {"cloud_001": KnownPose(truth[1])}
     found = align_many([PointCloud(x) for x in clouds], known=Known(poses=poses, fixed=["cloud_001"]), workers=2)
     assert np.allclose(found.scans[1].T_component_scan, truth[1], atol=1e-9)
-    for n in (0, 2, 3):
+    for n in (0, 2):
         assert np.allclose(found.scans[n].T_component_scan[:3, 3], truth[n][:3, 3], atol=0.05)
     assert found.anchors == [None]
 
@@ -135,7 +135,7 @@ def test_a_bound_on_the_shift_keeps_scans_apart(room):
 
 @pytest.mark.slow
 def test_levelled_scans_stay_level(room):
-    clouds, truth = room
+    clouds, truth = (several[:3] for several in room)
     level = [x @ T[:3, :3].T + [3.0 * n, 0, 0] for n, (x, T) in enumerate(zip(clouds, truth, strict=True))]
     found = align_many([PointCloud(x) for x in level], Options(dof="yaw"), workers=2)
     assert found.whole
