@@ -3,8 +3,9 @@
     python docs/examples.py docs/tutorials/two-scans.md            # do they run?
     python docs/examples.py --update docs/tutorials/*.md           # put their output into the text blocks after them
 
-Of a page, the blocks ``bash`` and ``python`` run in order in one fresh folder; blocks of other kinds are only shown. A
-block ``text`` right after one that runs is its output. Comments before a block, not shown on the page:
+Of a page, the blocks ``bash`` and ``python`` run in order in one fresh folder, a ``bash`` block line by line; blocks of
+other kinds are only shown. A block ``text`` right after one that runs is its output. Comments before a
+block, not shown on the page:
 
     <!-- in tests: --scans 20 -> --scans 4 -->    what the tests run in its place, to be quick
     <!-- exit: 3 -->                              it ends with this code (uncertain)
@@ -15,12 +16,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import glob
 import io
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +35,9 @@ BLOCK = re.compile(
     re.DOTALL,
 )
 
+
+PLAIN = re.compile(r"fmr [^|&;<>$`(\\]*")  # a line with nothing for a shell to do, but for names with *
+Here = Callable[[list[str]], tuple[int, str]]  # arguments of fmr to its exit code and what it says
 
 SECONDS = re.compile(r"\b\d+\.\d\d s\b")  # differ with the machine and what else it does
 
@@ -61,23 +68,46 @@ def examples(text: str) -> list[Example]:
     return found
 
 
-def run_page(page: Path, quick: bool = True) -> list[str]:
-    """What each block of a page prints. Raises AssertionError where one does not end as it says."""
+def run_page(page: Path, quick: bool = True, here: Here | None = None) -> list[str]:
+    """What each block of a page prints. Raises AssertionError where one does not end as it says.
+
+    here: runs `fmr` within this process where a line is nothing else: to start one takes longer than most of them do.
+    """
     printed, namespace = [], dict[str, Any]()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for example in examples(page.read_text("utf-8")):
             code = example.quick if quick else example.code
-            printed.append(run_bash(code, example.exit) if example.kind == "bash" else run_python(code, namespace))
+            printed.append(
+                run_bash(code, example.exit, here) if example.kind == "bash" else run_python(code, namespace)
+            )
     return printed
 
 
-def run_bash(code: str, expected: int) -> str:
-    script = f'set -e\nfmr() {{ "{sys.executable}" -m fmr_cli.cli "$@"; }}\n{code}'
+def run_bash(code: str, expected: int, here: Here | None = None) -> str:
+    printed = ""
+    for line in code.splitlines():
+        if here and PLAIN.fullmatch(line):
+            ended, said = here([name for word in shlex.split(line, comments=True)[1:] for name in names(word)])
+        else:
+            ended, said = run_line(line)
+        printed += said
+        if ended:
+            break
+    assert ended == expected, f"{code}\nends with {ended}, not {expected}:\n{printed}"
+    return printed
+
+
+def names(word: str) -> list[str]:
+    """The files that a word with * stands for; the word itself where there are none."""
+    return sorted(glob.glob(word)) or [word]
+
+
+def run_line(line: str) -> tuple[int, str]:
+    script = f'fmr() {{ "{sys.executable}" -m fmr_cli.cli "$@"; }}\n{line}'
     environment = {**os.environ, "COLUMNS": "120", "NO_COLOR": "1", "PYTHONWARNINGS": "ignore"}
     done = subprocess.run(["bash", "-c", script], env=environment, text=True, stdout=subprocess.PIPE,
                           stderr=subprocess.STDOUT, timeout=900)  # fmt: skip
-    assert done.returncode == expected, f"{code}\nends with {done.returncode}, not {expected}:\n{done.stdout}"
-    return done.stdout
+    return done.returncode, done.stdout
 
 
 def run_python(code: str, namespace: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ import csv
 import layouts
 import pytest
 
-QUICK = ("--pairs", "4", "--points", "128", "--clouds", "1", "--no-align")
+QUICK = ("--pairs", "2", "--points", "128", "--clouds", "1", "--no-align")
 
 
 def test_tables_csv_and_plots(tmp_path, fmr, samples):

@@ -177,7 +177,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(fmr, folder):
         return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
     journal = folder / "out" / "journal.jsonl"
-    for size, file, extra in ((6_000, "journal.jsonl", ()), (100_000, "out/aligned/s0.ply", ("--resume",))):
+    for size, file, extra in ((4_000, "journal.jsonl", ()), (100_000, "out/aligned/s0.ply", ("--resume",))):
         process = started(folder, *extra, preexec_fn=limited(size))
         said = process.communicate()[1]
         assert process.returncode == 2, said
@@ -204,7 +204,7 @@ def test_resume_refuses_other_settings(fmr, run):
 @pytest.mark.slow
 def test_what_cannot_be_joined_is_exit_code_3_and_said(fmr, folder):
     (folder / "scans" / "s2.ply").unlink()
-    points = np.random.default_rng(0).normal(size=(500, 3))
+    points = np.random.default_rng(0).normal(size=(2000, 3))
     write_cloud(folder / "scans" / "noise.ply", PointCloud(points))
     (folder / "scans" / "broken.ply").write_text("ply\n")
     done = fmr("multiway", "scans", "--out", "out", "--merged", "all.ply", "--merged-voxel", 0.2, cwd=folder)

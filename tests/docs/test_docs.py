@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import command
 import pytest
 from typer.main import get_command
 
@@ -43,9 +44,9 @@ def test_it_builds_and_every_link_and_anchor_leads_somewhere(tmp_path: Path) -> 
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     reference = (tmp_path / "site/reference/commands.html").read_text("utf-8")
-    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
+    for name, described in get_command(app).commands.items():  # type: ignore[attr-defined]
         assert f"fmr {name}</h2>" in reference or f'id="fmr-{name}"' in reference
-        for option in command.params:
+        for option in described.params:
             for flag in option.opts if option.param_type_name == "option" else ():
                 assert flag in reference, f"{name} {flag}"
     method = (tmp_path / "site/method/index.html").read_text("utf-8")
@@ -58,7 +59,14 @@ def test_it_builds_and_every_link_and_anchor_leads_somewhere(tmp_path: Path) -> 
     for page in WITH_EXAMPLES
 ])  # fmt: skip
 def test_the_examples_run(page: Path) -> None:
-    examples.run_page(page)
+    """Those of the first page as a shell runs them, each command a process."""
+    examples.run_page(page, here=None if page.name == FIRST else within)
+
+
+def within(arguments: list[str]) -> tuple[int, str]:
+    """`fmr` within this process: its exit code, and what it says."""
+    done = command.here(*arguments, cwd=Path.cwd())
+    return done.returncode, done.stdout + done.stderr
 
 
 def test_an_example_that_does_not_run_is_told(tmp_path: Path) -> None:
