@@ -107,8 +107,8 @@ class DaskWorkers:
                 why = "it speaks another language" if isinstance(error, MemoryError) else reason(error)
                 why = re.sub("^in <.*?>: ", "", why)[:120]  # a comm
                 raise FmrError(
-                    f"--dask {self.address}: no Dask scheduler that takes this client answers there ({why}); give the "
-                    "scheduler's address, not its dashboard's, and tls:// with certificates it knows where it wants TLS"
+                    f"--dask {self.address}: no Dask scheduler answers there ({why}); check the port, which is not "
+                    "the dashboard's, and whether it wants tls:// and certificates that it knows"
                 ) from None
         try:
             if has_page(self.client.dashboard_link):
