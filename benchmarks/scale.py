@@ -18,7 +18,7 @@ import os
 import pickle
 import tempfile
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -80,25 +80,35 @@ def first_of(manifest: Path, count: int) -> Path:
     return path
 
 
-def throughput(manifest: Path, workers: int, dask: bool) -> dict[str, Any]:
+class EnoughError(Exception):
+    """The minutes that a run may take are over."""
+
+
+def throughput(manifest: Path, workers: int, dask: bool, minutes: float = np.inf) -> dict[str, Any]:
     """One run of a batch: its pairs a second from the first row to the last, seconds in all, CPU seconds a pair.
 
-    cpu ms at this end: of them, what the command's process takes a pair: it hands out and writes; with Dask it is the
-    scheduler too. bytes a pair: over this machine's loopback, which other programs may use as well.
+    minutes: after which it is cut off, as by Ctrl-C. cpu ms at this end: of the processor, what the command's process
+    takes a pair: it hands out and writes; with Dask it is the scheduler too. bytes a pair: over this machine's
+    loopback, which other programs may use as well.
     """
     told: list[float] = []
+
+    def on_row(row: dict[str, Any], done: int, total: int) -> None:
+        assert row["status"] != "failed", row["message"]
+        told.append(time.perf_counter())
+        if told[-1] - begin > 60 * minutes:
+            raise EnoughError
+
     with tempfile.TemporaryDirectory() as out, ExitStack() as stack:
         begin, before, here, sent = time.perf_counter(), cpu_seconds(), time.process_time(), loopback()
         team = stack.enter_context(DaskWorkers("local", workers, lambda _: None)) if dask else workers
-        rows = align_batch(
-            manifest, Path(out) / "out", workers=team, on_row=lambda *_: told.append(time.perf_counter())
-        )
+        with suppress(EnoughError):
+            align_batch(manifest, Path(out) / "out", workers=team, on_row=on_row)
         took, cpu = time.perf_counter() - begin, cpu_seconds() - before
         here, sent = time.process_time() - here, loopback() - sent
-    count = len(rows)
-    assert not any(row["status"] == "failed" for row in rows)
-    return {"by": f"{workers} {'Dask workers' if dask else 'processes'}", "pairs": count,
-            "pairs/s": (count - 1) / (told[-1] - told[0]), "s in all": took, "cpu s a pair": cpu / count,
+    count = len(told)
+    return {"by": f"{workers} {'Dask workers' if dask else 'processes'}", "pairs": len(read_manifest(manifest)),
+            "done": count, "pairs/s": (count - 1) / (told[-1] - told[0]), "s in all": took, "cpu s a pair": cpu / count,
             "cpu ms at this end": 1000 * here / count, "bytes a pair": sent / count if dask else None}  # fmt: skip
 
 
@@ -223,6 +233,7 @@ def main() -> None:
     parser.add_argument("--tasks", type=int, nargs="+", default=[100, 1_000, 10_000])
     parser.add_argument("--counts", type=int, nargs="+", default=[100, 1_000, 10_000])
     parser.add_argument("--small", type=int, default=1_000, help="points of a cloud of ``pairs``")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="of ``pairs``, after which a run is cut off")
     parser.add_argument("--both", type=int, default=1_000, help="pairs from which on Dask alone does them")
     parser.add_argument("--out", type=Path, default=Path("scale.json"))
     given = parser.parse_args()
@@ -237,11 +248,12 @@ def main() -> None:
                 print(line)
         elif given.what == "pairs":
             manifest = write_pairs(folder, max(given.counts), quickest(room_pairs(24, given.small), 4))
-            found["pairs"] = []
+            done = {(row["by"], row["pairs"]): row for row in found.get("pairs", [])}  # the last of each stays
             for count in given.counts:
                 for dask in (True, False) if count <= given.both else (True,):
-                    row = throughput(first_of(manifest, count), 2, dask)
-                    found["pairs"].append(row | {"points": given.small})
+                    row = throughput(first_of(manifest, count), 2, dask, given.minutes)
+                    done[row["by"], count] = row | {"points": given.small}
+                    found["pairs"] = list(done.values())
                     write_json(given.out, found)  # the larger ones take long
             show(f"pairs of {given.small} points", found["pairs"])
         elif given.what == "scheduler":
