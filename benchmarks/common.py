@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -21,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.cores import usable_cores
 from fmr_cli.evaluation.baselines import Baseline, gicp, global_baselines, then_gicp
-from fmr_cli.io import SUFFIXES, read_cloud, write_cloud
+from fmr_cli.io import SUFFIXES, read_cloud
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import align
 from fmr_cli.report import plots
@@ -106,37 +102,7 @@ def ways(voxel: float, reach: float) -> dict[str, Baseline]:
         for name, start in peers.items()
     }
     found["small_gicp from the identity"] = partial(gicp, voxel=voxel, reach=reach, threads=CORES)
-    if shutil.which("CloudCompare"):  # apt-get install cloudcompare
-        found["CloudCompare ICP from the identity"] = cloud_compare
     return found
-
-
-def cloud_compare(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """T_target_source by CloudCompare's command line: files, its ICP from where the clouds are, the matrix it writes.
-
-    It is told that 70 % overlap, the least of the protocols.
-    """
-    with tempfile.TemporaryDirectory() as made:
-        folder = Path(made)
-        files = [folder / "source.ply", folder / "target.ply"]
-        for file, points in zip(files, (source, target), strict=True):
-            write_cloud(file, PointCloud(points))
-        command = [
-            "CloudCompare",
-            "-SILENT",
-            "-AUTO_SAVE",
-            "OFF",
-            "-O",
-            files[0],
-            "-O",
-            files[1],
-            "-ICP",
-            "-OVERLAP",
-            "70",
-        ]
-        subprocess.run(command, env=os.environ | {"QT_QPA_PLATFORM": "offscreen"}, check=True, capture_output=True)
-        (matrix,) = folder.glob("source_REGISTRATION_MATRIX_*.txt")
-        return np.loadtxt(matrix)
 
 
 def interleaved(runs: Mapping[str, Callable[[], Any]], repeats: int, warm: bool = False) -> dict[str, list[float]]:
