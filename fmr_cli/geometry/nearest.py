@@ -34,7 +34,7 @@ class NearestDistance:
 
 
 def along_curve(points: np.ndarray) -> np.ndarray:
-    """The order of points (N, 3) along a Z-order curve through their box, its longest side halved BITS times in turn."""
+    """The order of points (N, 3) along a Z-order curve through their box, whose longest side is halved BITS times."""
     low = points.min(0)
     size = np.maximum(points.max(0) - low, 1e-300)
     sides, turns = size.copy(), []

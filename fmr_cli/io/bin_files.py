@@ -223,12 +223,12 @@ def name_singly(extra: np.ndarray, first: int, wide: bool = False) -> list[str]:
         whole = bool(len(column) and (column == np.rint(column)).all() and column.min() >= 0)
         if k == 0 and not wide:
             names.append("intensity")
-        elif k == 0 and packs_color(column):
-            names.append("color")
         elif whole and column.max() < RINGS and "ring" not in names:
             names.append("ring")
         elif rises(column) and "time" not in names:
             names.append("time")
+        elif k == 0 and packs_color(column):
+            names.append("color")
         else:
             names.append(f"column_{first + k}" if k else "intensity")
     return names
