@@ -89,7 +89,7 @@ def find_columns(path: Path, size: int) -> tuple[str, ...] | None:
         return columns_of(sample, size, "")
     if size % NCLT.itemsize == 0 and is_nclt(path):
         return None
-    found = [columns for columns in PACKED if is_packed(path, size, columns)]
+    found: list[tuple[str, ...]] = [columns for columns in PACKED if is_packed(path, size, columns)]
     packed = [record_of(columns).itemsize for columns in found]
     # Two records of another kind may look like one of many numbers
     found += [columns for columns in wholes if all(record_of(columns).itemsize % width for width in packed)]
