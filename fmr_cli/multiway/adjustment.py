@@ -8,14 +8,13 @@ import numpy as np
 
 from fmr_cli.cloud import angle_degrees
 from fmr_cli.geometry.frames import leave_frames
-from fmr_cli.multiway import consistency, joint, looks, pose_graph
-from fmr_cli.multiway.consistency import AGREE, Component, Join
+from fmr_cli.multiway import claims, consistency, joint, looks, pose_graph
+from fmr_cli.multiway.consistency import Component, Join
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Apart, Network, Placed
 from fmr_cli.multiway.pose_graph import Factor, Prior, Solution
 from fmr_cli.multiway.survey import Survey, nearest_pairs
 
-LEAST_CONFIDENT = 0.1  # of a hypothesis that counts once the network agrees with it
 DOUBTFUL = 1.5  # voxel edges that a link may differ from what all others say, ...
 OUTLYING = 5.0  # ... or so many times what links differ by in the median
 TESTS = 10  # rounds of throwing out links, at most
@@ -49,7 +48,7 @@ def adjust(survey: Survey) -> Network:
             scans[n].residual = refined.residual[n]
             scans[n].links = sum(n in link.ends and link.chosen is not None for link in survey.links.values())
         anchors.append(None if component.held else survey.scans[anchor].name)
-    telling = consistency.telling(survey.links.values())
+    telling = claims.telling(survey.links.values())
     links = [judged(survey, survey.links[ends], telling) for ends in sorted(survey.links, key=lambda e: (e[1], e[0]))]
     counts = {"scans": len(scans), "looked_at": len(survey.looks), "registered": len(survey.tried)}
     return Network(
@@ -69,7 +68,8 @@ def adjusted(survey: Survey, component: Component) -> tuple[Solution, int]:
     anchor = anchor_of(survey, component, used)
     held = component.held or (set() if priors else {anchor})
     motion = survey.motion(anchor, anchor)
-    for _ in range(TESTS):
+    out: list[Link] = []
+    for turn in range(TESTS):
         factors = [factor_of(survey, link) for link in used]
         solution = pose_graph.optimise(poses, factors, priors, held, motion, edge)
         poses = solution.T_component_scan
@@ -78,14 +78,19 @@ def adjusted(survey: Survey, component: Component) -> tuple[Solution, int]:
         limit = max(DOUBTFUL, OUTLYING * float(np.median(off[told]))) if told.any() else np.inf
         worst = [k for k in np.argsort(-np.nan_to_num(off)) if told[k] and off[k] > limit][: max(1, len(used) // 20)]
         worst = [k for k in worst if still_joined(component, [x for m, x in enumerate(used) if m != k])]
-        if not worst:
+        # A right link may have gone out while a wrong one still bent the network.
+        back = [x for x in out if not worst and contradiction(survey, x, between(poses, x)) <= DOUBTFUL]
+        if turn == TESTS - 1 or not (worst or back):
             break
-        for k in worst:
-            if used[k].status == "aligned":
-                used[k].status = "rejected"
-                used[k].message = said(used[k], f"the other links have it {off[k] * used[k].edge:.3g} elsewhere")
-            used[k].chosen = None
-        used = [link for k, link in enumerate(used) if k not in set(worst)]
+        returned = {x.ends for x in back}
+        out = [x for x in out if x.ends not in returned] + [used[k] for k in worst]
+        used = [link for k, link in enumerate(used) if k not in set(worst)] + back
+    for link in out:
+        if link.status == "aligned":
+            link.status = "rejected"
+            elsewhere = contradiction(survey, link, between(poses, link)) * link.edge
+            link.message = said(link, f"the other links have it {elsewhere:.3g} elsewhere")
+        link.chosen = None
     component.T_component_scan.update(poses)
     return solution, anchor
 
@@ -94,31 +99,28 @@ def agreeing(survey: Survey, component: Component) -> list[Link]:
     """The links within a component, each with the hypothesis that agrees with its poses; those without are rejected."""
     used = []
     poses = component.T_component_scan
-    lenient = 1 + 0.1 * np.sqrt(len(poses))
-    telling = consistency.telling(survey.links.values())
+    telling = claims.telling(survey.links.values())
     for link in survey.links.values():
         if link.source not in poses or link.target not in poses or not link.hypotheses:
             continue
-        expected = np.linalg.inv(poses[link.target]) @ poses[link.source]
-        T = np.stack([h.T_target_source for h in link.hypotheses])
-        off = looks.displacement(T, expected, survey.moment(link.source))
+        agreed = claims.agreeing(link, poses, survey.moment(link.source), link.source in telling)
         both_held = link.source in component.held and link.target in component.held
-        agreed = [
-            k for k, h in enumerate(link.hypotheses)
-            if off[k] <= AGREE * lenient * link.edge and h.confidence >= LEAST_CONFIDENT
-            and not consistency.contradicted(h, link.source in telling)
-        ]  # fmt: skip
         if agreed and not both_held:
-            link.chosen = min(agreed, key=lambda k: off[k])
+            link.chosen = min(agreed, key=lambda k: agreed[k])
             used.append(link)
             if link.chosen > 0 and link.status == "aligned":
                 link.message = said(link, "the network has chosen another of its poses")
         elif link.status == "aligned" and not agreed:
             link.status = "rejected"
             what = "the poses of the fixed scans" if both_held else "other links"
-            if off[0] > AGREE * lenient * link.edge:
-                link.message = said(link, f"contradicts {what}: {off[0]:.3g} apart")
+            off = contradiction(survey, link, between(poses, link)) * link.edge
+            link.message = said(link, f"contradicts {what}: {off:.3g} apart")
     return used
+
+
+def between(T_component_scan: dict[int, np.ndarray], link: Link) -> np.ndarray:
+    """T_target_source of a link's scans at a component's poses."""
+    return np.linalg.inv(T_component_scan[link.target]) @ T_component_scan[link.source]
 
 
 def contradiction(survey: Survey, link: Link, T_target_source: np.ndarray | None) -> float:
@@ -148,12 +150,7 @@ def anchor_of(survey: Survey, component: Component, used: list[Link]) -> int:
 
 def still_joined(component: Component, links: list[Link]) -> bool:
     """Whether links join all scans of a component; scans that don't move are one."""
-    home = {n: ("held" if n in component.held else n) for n in component.T_component_scan}
-    for link in links:
-        a, b = home[link.source], home[link.target]
-        if a != b:
-            home = {n: a if h == b else h for n, h in home.items()}
-    return len(set(home.values())) == 1
+    return len(set(consistency.homes(component, [link.ends for link in links]).values())) == 1
 
 
 def mean_pose(poses: list[np.ndarray]) -> np.ndarray:
@@ -190,7 +187,7 @@ def judged(survey: Survey, link: Link, telling: set[int]) -> Link:
     home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
     if link.source in home and home[link.source] == home.get(link.target) and link.hypotheses:
         poses = survey.components[home[link.source]].T_component_scan
-        network = np.linalg.inv(poses[link.target]) @ poses[link.source]
+        network = between(poses, link)
         D = np.linalg.inv(network) @ link.T_target_source
         link.residual_rot_deg, link.residual_shift = (
             angle_degrees(D),
@@ -199,7 +196,7 @@ def judged(survey: Survey, link: Link, telling: set[int]) -> Link:
     elif link.status == "aligned":
         link = replace(link, status="rejected", message=said(link, "too much speaks against joining its components"))
     h = link.hypotheses[0] if link.hypotheses else None
-    if link.status == "rejected" and h and consistency.contradicted(h, link.source in telling):
+    if link.status == "rejected" and h and claims.contradicted(h, link.source in telling):
         link.message = said(link, str(h.seen))
     return link
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fmr_cli.multiway import consistency, looks, planes, visibility
+from fmr_cli.multiway import claims, looks, planes, visibility
 from fmr_cli.multiway.looks import Look
 from fmr_cli.multiway.survey import Ends, Survey, ends_of
 from fmr_cli.multiway.visibility import Seen
@@ -61,7 +61,7 @@ def look_by_planes(survey: Survey, most: float) -> bool:
     """
     size = {n: len(c.T_component_scan) for c in survey.components for n in c.T_component_scan}
     home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}
-    telling = consistency.telling(survey.links.values())
+    telling = claims.telling(survey.links.values())
     if not telling:
         return False
     scans = telling | {n for n in home if not linked(survey, n)}
@@ -102,9 +102,7 @@ def fresh(survey: Survey, pair: Ends, T_target_source: np.ndarray) -> bool:
     """Whether a pose is allowed, and no attempt at the pair has ended there."""
     moment, link = survey.moment(pair[0]), survey.links.get(pair)
     tried = [h.T_target_source for h in link.hypotheses] if link else []
-    near = any(
-        looks.displacement(T, T_target_source, moment) < consistency.AGREE * survey.edges[pair[0]] for T in tried
-    )
+    near = any(looks.displacement(T, T_target_source, moment) < claims.AGREE * survey.edges[pair[0]] for T in tried)
     return not near and survey.allowed(*pair, T_target_source)
 
 

@@ -1,11 +1,8 @@
 """Which poses of which links can be right together: hypotheses that agree join scans into components.
 
-Each hypothesis comes with the odds that ``align`` gives it. Those at which one scan contradicts the other one's view
-are out. Others that agree, directly or round a cycle, speak for each other, as far as wrong ones hardly ever agree. How
-often they do is told by how many of ``align``'s sure poses the views contradict: rooms that resemble each other do so
-for every scan in them (perceptual aliasing). Links that were tried and deny a join speak against it. The surest join is
-made first, so that what a wrong link says meets what many right ones have said before; and none is made where scans
-that it brings together contradict each other.
+Links that were tried and deny a join speak against it. The surest join is made first, so that what a wrong link says
+meets what many right ones have said before; and none is made where scans that it brings together contradict each other.
+What hangs on one link alone, while another one that is about as sure has it elsewhere, is taken off again.
 """
 
 from __future__ import annotations
@@ -17,16 +14,23 @@ from typing import Any
 
 import numpy as np
 
-from fmr_cli.multiway.links import Hypothesis, Link
+from fmr_cli.multiway.claims import (
+    AGREE,
+    CHANCE,
+    Claim,
+    agreeing,
+    agreement,
+    chance_of,
+    claims,
+    contradicted,
+    lenient,
+    log_odds,
+    telling,
+)  # fmt: skip
+from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
-from fmr_cli.multiway.visibility import NO_PLACE, Seen, doubt, from_one_place, total
+from fmr_cli.multiway.visibility import Seen, total
 
-AGREE = 4.0  # voxel edges, root mean square over a scan, that poses of one link or cycle may differ by
-CHANCE = 0.05  # that a wrong hypothesis agrees with another one, at least
-# Of 340 poses that ``align`` has found wrongly on the building of `python -m benchmarks.multiway` none has a
-# contradiction below 1.2; of the right ones half are below 0.1.
-CONFIRMS, ENOUGH = 4.6, 800  # log odds that views add to a pose that they find nothing against; points that must agree
-UNLIKELY = 0.01  # confidence of a hypothesis, below which it speaks for nothing
 JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
 DOUBTFUL = 0.9  # the same where none is, but several agree: two rooms that resemble each other agree in a doubtful way
 DENIALS = (
@@ -36,8 +40,7 @@ DENIALS = (
 RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
 MET = 10  # pairs of scans of two components whose views are compared before these are joined
 FLAGRANT = 4.0  # times what contradicts a pose, of one such pair alone, forbid a join; of all together, once
-SURE = 4.6  # log odds, at most, that ``align`` gives a hypothesis: of scans of a new kind it may misjudge one in 100
-CERTAIN = 12.0  # log odds of a link that is given, and at most of all triangles over one hypothesis
+DISPUTED = 0.1  # probability that a link is the wrong one of a cycle, from which nothing hangs on it alone
 
 
 @dataclass
@@ -69,117 +72,6 @@ class Join:
         if self.sound:
             return self.probability >= JOINED
         return len(self.links) > 1 and self.probability >= DOUBTFUL
-
-
-@dataclass(frozen=True)
-class Claim:
-    """One hypothesis of one link. log_odds: of its own; support: scan by scan, what the triangle over it adds.
-
-    sound: ``align`` is sure of it, or views confirm it.
-    """
-
-    link: int
-    choice: int
-    log_odds: float
-    sound: bool
-    support: dict[int, float]
-
-    def odds(self, *components: Component) -> float:
-        """With triangles over scans outside the components: links to those inside are claims of the join themselves."""
-        outside = (x for k, x in self.support.items() if not any(k in c.T_component_scan for c in components))
-        return self.log_odds + min(sum(outside), CERTAIN)
-
-
-def log_odds(h: Hypothesis, one_place: bool) -> float:
-    """Of one hypothesis: what ``align`` says, less what views say against it, where they tell anything."""
-    if h.confidence == 1:  # given
-        return CERTAIN
-    c = max(h.confidence, 1e-9)
-    views = support(h.seen) - doubt(h.seen) if one_place else 0.0
-    return min(float(np.log(c / (1 - c))) + views, SURE)
-
-
-def support(seen: Seen | None) -> float:
-    """What views that find next to nothing against a pose add to its log odds, where they have enough to say."""
-    return CONFIRMS * max(1 - seen.contradiction**2, 0.0) * min(seen.agreeing / ENOUGH, 1.0) if seen else 0.0
-
-
-def confirmed(h: Hypothesis, one_place: bool) -> bool:
-    """Whether views alone make a pose sound that ``align`` is not sure of: so many points, so little against it."""
-    clear = h.seen is not None and h.seen.agreeing >= ENOUGH and h.seen.contradiction < 0.5
-    return one_place and h.firm and clear
-
-
-def contradicted(h: Hypothesis, one_place: bool) -> bool:
-    """Whether views rule a hypothesis out."""
-    return one_place and h.seen is not None and h.seen.contradiction >= 1
-
-
-def telling(links: Iterable[Link]) -> set[int]:
-    """The scans whose views tell right poses from wrong ones, by their links.
-
-    A scan that no sure link has judged yet is one of them if it was tried against one and a viewpoint explains it.
-    """
-    tried = [(x.ends, h) for x in links if x.start != "known" for h in x.hypotheses if h.seen is not None]
-    sure = [(ends, h.seen) for ends, h in tried if h.aligned and h.seen is not None]
-    scans, judged = from_one_place(sure), {n for ends, _ in sure for n in ends}
-    explained = {ends for ends, h in tried if h.seen is not None and h.seen.hidden <= NO_PLACE}
-    return scans | {n for ends in explained if scans.intersection(ends) for n in ends if n not in judged}
-
-
-def chance_of(links: Iterable[Link], scans: set[int]) -> float:
-    """That a wrong hypothesis agrees with another one: the share of ``align``'s sure poses that views rule out."""
-    ruled_out = [contradicted(h, True) for x in links if x.source in scans for h in x.hypotheses if h.aligned]
-    return max(float(np.mean(ruled_out)) if ruled_out else 0.0, CHANCE)
-
-
-def agreement(log_odds: float, chance: float) -> float:
-    """What a hypothesis of those odds adds to the log odds of another one that it agrees with.
-
-    By Bayes' rule: P(agrees | right) / P(agrees | wrong), where it agrees if it is right, or by chance.
-    """
-    return float(np.logaddexp(0.0, log_odds - np.log(chance)))
-
-
-def both(a: float, b: float) -> float:
-    """The log odds that two hypotheses are right, from those of each."""
-    return -float(np.logaddexp(np.logaddexp(-a, -b), -a - b))
-
-
-def claims(links: list[Link], moments: dict[int, np.ndarray], scans: set[int], chance: float) -> list[Claim]:
-    """Every hypothesis that may be right, with what it says by itself and what each triangle that it closes adds."""
-    poses: dict[tuple[int, int], list[tuple[np.ndarray, float, float]]] = defaultdict(
-        list
-    )  # T_second_first, odds, edge
-    near: dict[int, set[int]] = defaultdict(set)
-    own = []
-    for number, link in enumerate(links):
-        i, j = link.ends
-        for choice, h in enumerate(link.hypotheses):
-            if h.confidence < UNLIKELY or contradicted(h, link.source in scans):
-                continue
-            odds = log_odds(h, link.source in scans)
-            own.append((number, choice, odds))
-            poses[i, j].append((h.T_target_source, odds, link.edge))
-            poses[j, i].append((np.linalg.inv(h.T_target_source), odds, link.edge))
-            near[i].add(j)
-            near[j].add(i)
-    found = []
-    for number, choice, odds in own:
-        link, h = links[number], links[number].hypotheses[choice]
-        i, j = link.ends
-        support = {}
-        for k in sorted(near[i] & near[j]):
-            best = 0.0
-            for T_ki, a, edge_a in poses[i, k]:
-                for T_jk, b, edge_b in poses[k, j]:
-                    reach = AGREE * 1.5 * max(link.edge, edge_a, edge_b)
-                    if displacement(T_jk @ T_ki, h.T_target_source, moments[i]) < reach:
-                        best = max(best, agreement(both(a, b), chance))
-            if best:
-                support[k] = best
-        found.append(Claim(number, choice, odds, h.aligned or confirmed(h, link.source in scans), support))
-    return found
 
 
 def joined(
@@ -272,7 +164,13 @@ def joined(
             del joins[key]
         exact = {k for k in exact if keep not in k and gone not in k}
         joins.update({key: found[0] for key in between if keep in key and (found := rivals(key, exact=False))})
-    order = sorted(components.values(), key=lambda c: (-len(c.T_component_scan), min(c.T_component_scan)))
+    parts: list[Component] = []
+    seen_through = {n for join in refused for n in join.links}
+    for component in components.values():
+        pieces, disputed = undisputed(component, links, moments, scans, seen_through)
+        parts += pieces
+        refused += disputed
+    order = sorted(parts, key=lambda c: (-len(c.T_component_scan), min(c.T_component_scan)))
     place = {n: k for k, c in enumerate(order) for n in c.T_component_scan}
     left: dict[tuple[int, int], Join] = {}
     for join in [*joins.values(), *refused]:
@@ -281,6 +179,82 @@ def joined(
         if place[i] != place[j] and (ends not in left or join.log_odds > left[ends].log_odds):
             left[ends] = join
     return order, left
+
+
+def undisputed(
+    component: Component, links: list[Link], moments: dict[int, np.ndarray], scans: set[int], refused: set[int]
+) -> tuple[list[Component], list[Join]]:
+    """The parts of a component that don't hang on a link which is as likely wrong as one that contradicts it.
+
+    A sure link that the poses contradict closes a cycle with those that they agree with, of which one at least is
+    wrong. Where others bypass it, they tell which. Of those that nothing bypasses (bridges), and of the link itself,
+    P(k is wrong) is in proportion to exp(-log odds of k). Also gives the joins that are taken off.
+    refused: links, by number, that deny nothing, since views forbid what they say.
+    """
+    poses = component.T_component_scan
+    holding: dict[int, float] = {}  # links, by number: their log odds
+    against: dict[int, float] = {}
+    for number, link in enumerate(links):
+        if link.source not in poses or link.target not in poses:
+            continue
+        told = link.source in scans
+        agreed = agreeing(link, poses, moments[link.source], told)
+        if agreed:
+            holding[number] = max(log_odds(link.hypotheses[k], told) for k in agreed)
+        elif link.status == "aligned" and number not in refused and not contradicted(link.hypotheses[0], told):
+            against[number] = log_odds(link.hypotheses[0], told)
+    if component.held:  # whatever its scans' links say, they are where they are
+        holding = {n: x for n, x in holding.items() if not component.held.issuperset(links[n].ends)}
+    cut: dict[int, float] = {}  # links that are taken off: the probability that each is right
+    for number in sorted(against, key=lambda n: (-against[n], n)):
+        bridges = bridges_between(component, links, [n for n in holding if n not in cut], *links[number].ends)
+        if bridges:
+            odds = np.array([against[number], *(holding[n] for n in bridges)])
+            wrong = np.exp(-odds - np.logaddexp.reduce(-odds))
+            cut.update({n: 1 - float(p) for n, p in zip(bridges, wrong[1:], strict=True) if p > DISPUTED})
+    if not cut:
+        return [component], []
+    ends = [links[n].ends for n in holding if n not in cut]
+    loose = sorted(set(homes(component, [links[n].ends for n in holding]).values()))
+    ends += [(loose[0], other) for other in loose[1:]]  # joined by what agrees too little to hold by itself
+    groups: dict[int, dict[int, np.ndarray]] = defaultdict(dict)
+    for n, home in homes(component, ends).items():
+        groups[home][n] = poses[n]
+    parts = [Component(group, component.held & group.keys()) for group in groups.values()]
+    joins = [Join(np.eye(4), holding[n], right, 1 - right, (n,), 0, True) for n, right in sorted(cut.items())]
+    return parts, joins
+
+
+def bridges_between(component: Component, links: list[Link], some: list[int], source: int, target: int) -> list[int]:
+    """Those of ``some`` links, by number, without any one of which two scans of a component fall apart."""
+    ends = {n: links[n].ends for n in some}
+    near: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for n, (i, j) in ends.items():
+        near[i].append((j, n))
+        near[j].append((i, n))
+    came: dict[int, tuple[int, int]] = {source: (source, -1)}  # by a search in width: the scan before, and the link
+    front = [source]
+    while front and target not in came:
+        front = [
+            m for k in front for m, n in near[k] if m not in came and came.setdefault(m, (k, n))
+        ]  # fmt: skip
+    path = []
+    at = target if target in came else source
+    while at != source:
+        at, n = came[at]
+        path.append(n)
+    apart = (homes(component, [e for m, e in ends.items() if m != n]) for n in path)  # a bridge lies on every way
+    return [n for n, home in zip(path, apart, strict=True) if home[source] != home[target]]
+
+
+def homes(component: Component, ends: Iterable[tuple[int, int]]) -> dict[int, int]:
+    """The part of a component that each scan is in, if links join so many pairs; scans that don't move are in one."""
+    home = {n: min(component.held) if n in component.held else n for n in component.T_component_scan}
+    for i, j in ends:
+        a, b = home[i], home[j]
+        if a != b:
+            home = {n: a if h == b else h for n, h in home.items()}
+    return home
 
 
 def forbidden(seen: list[Seen]) -> bool:
@@ -324,10 +298,11 @@ def joins_between(
 
     some: the claims between the two; tried: links between them that may deny it, those that found nothing too.
     """
-    odds = {(c.link, c.choice): c.odds(first, second) for c in some}
+    inside = first.T_component_scan.keys() | second.T_component_scan.keys()
+    odds = {(c.link, c.choice): c.odds(inside) for c in some}
     ranked = sorted(some, key=lambda c: (-odds[c.link, c.choice], c.link, c.choice))
     T_join = np.stack([implied(first, second, links[c.link], c.choice) for c in ranked])  # second <- first
-    lenient = 1 + 0.1 * np.sqrt(len(first.T_component_scan) + len(second.T_component_scan))  # poses drift along chains
+    reach = AGREE * lenient(len(inside))
     best: list[Join] = []
     taken = np.zeros(len(ranked), bool)
     for lead in range(len(ranked)):
@@ -340,9 +315,9 @@ def joins_between(
             scan = link.source if link.source in first.T_component_scan else link.target
             pose = first.T_component_scan[scan]
             off = displacement(T_join @ pose, T_join[k] @ pose, moments[scan])
-            if off[lead] < AGREE * lenient * link.edge:
+            if off[lead] < reach * link.edge:
                 taken[k] = True
-                apart += np.minimum(off, AGREE * lenient * link.edge)
+                apart += np.minimum(off, reach * link.edge)
                 agreed.setdefault(claim.link, claim)
         T_agreed = T_join[int(apart.argmin())]  # the pose in their middle: the lead may be a little wrong
         score = odds[ranked[lead].link, ranked[lead].choice]

@@ -13,7 +13,7 @@ from fmr_cli.errors import FmrError, ModelError
 from fmr_cli.geometry.frames import enter_frames, leave_frames
 from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.io.files import reason
-from fmr_cli.multiway import consistency
+from fmr_cli.multiway import claims, consistency
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.links import Hypothesis, Link, best_of, key_of
 from fmr_cli.multiway.looks import best_of as best_look
@@ -159,10 +159,10 @@ def judge_views(survey: Survey, links: list[Link]) -> None:
 
 def keep(survey: Survey, links: list[Link]) -> None:
     """Takes links in, each beside what another attempt at its pair has given."""
-    scans = consistency.telling([*survey.links.values(), *links])
+    scans = claims.telling([*survey.links.values(), *links])
 
     def worth(link: Link) -> float:
-        return max((consistency.log_odds(h, link.source in scans) for h in link.hypotheses[:1]), default=-np.inf)
+        return max((claims.log_odds(h, link.source in scans) for h in link.hypotheses[:1]), default=-np.inf)
 
     for link in links:
         survey.links[link.ends] = best_of(survey.links.get(link.ends), link, worth)

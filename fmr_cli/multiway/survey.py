@@ -17,7 +17,7 @@ import fmr_cli
 from fmr_cli.errors import FmrError
 from fmr_cli.geometry.frames import Frame, enter_frames
 from fmr_cli.geometry.motion import Motion
-from fmr_cli.multiway import consistency, looks, visibility
+from fmr_cli.multiway import claims, looks, visibility
 from fmr_cli.multiway.consistency import Component, Join
 from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of, poses_in_file
 from fmr_cli.multiway.links import Journal, Link
@@ -225,7 +225,7 @@ class Survey:
         expected = enter_frames(np.eye(4), self.frames[source], self.frames[target])
         if source in self.poses and target in self.poses:
             expected, slack = self.predicted(source, target)
-            edge = consistency.AGREE * max(self.edges[source], self.edges[target])
+            edge = claims.AGREE * max(self.edges[source], self.edges[target])
             if float(looks.displacement(T_target_source, expected, self.moment(source))) > slack + edge:
                 return False
         bound = self.options.max_shift

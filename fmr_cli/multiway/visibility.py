@@ -203,17 +203,22 @@ def compare(source: Viewed, target: Viewed, T_target_source: np.ndarray, count: 
 
 
 def seen_by(viewer: Viewed, scan: Viewed, T_viewer_scan: np.ndarray, count: int) -> Seen:
-    """What a viewer says of those of a scan's first points whose surface faces it, on either side."""
+    """What a viewer says of those of a scan's first points whose surface faces it, on either side.
+
+    Only where it has points enough to see through them if it did: elsewhere it finds nothing against any pose, and
+    what a sparse scan cannot deny is no agreement.
+    """
     R, t = T_viewer_scan[:3, :3], T_viewer_scan[:3, 3]
     points, normals = scan.some[:count] @ R.T + t, scan.normals[:count] @ R.T
     edge = max(scan.edge, viewer.edge)
     rays = points - viewer.viewpoint
     cell, distance = cells(rays)
     facing = np.abs(np.einsum("ni,ni->n", rays, normals)) > FACING * distance
+    told = facing & (viewer.count[cell] >= SEEN)
     gap, counterpart = viewer.tree.query(points, distance_upper_bound=NEAR * edge)
     near = np.isfinite(gap)
-    through = facing & ~near & (viewer.count[cell] >= SEEN) & (viewer.nearest[cell] > distance + APART * edge)
-    met = near & facing
+    through = told & ~near & (viewer.nearest[cell] > distance + APART * edge)
+    met = told & near
     opposed = np.einsum("ni,ni->n", normals[met], viewer.facing[counterpart[met]]) < OPPOSED
     return Seen(int(through.sum()), int(opposed.sum()), int((~opposed).sum()))
 

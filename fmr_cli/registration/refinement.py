@@ -31,7 +31,7 @@ COMMON_REACH = 4.0  # voxel edges: points nearer than that to the other surface 
 DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
 # Tried on RedKitchen scans, by hand: roughness 0.22 at 1 % noise, below 0.08 without; 30 neighbours best of 10 to 50.
-ROUGH, SMOOTHED_OVER = 0.12, 30
+ROUGH, CLEAN, SMOOTHED_OVER = 0.12, 0.08, 30
 NOISE_GROWTH = (SMOOTHED_OVER / NEAR) ** 0.5  # of the deviation from the small planes to the wide ones, at most
 SMOOTHED_REACHES = (1.0, 1.0, 0.7, 0.7, 0.5, 0.5)  # voxel edges, a step each
 GICP_REACH = 3.0  # voxel edges: source points further from the target slow its k-d tree down, by up to 500 times
@@ -121,9 +121,17 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     if pair.options.scale or pair.motion.dof != "rigid":
         s, t = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge)
         return constrained(s, t, T_target_source, pair.edge, pair.motion.basis(), pair.options.scale)
-    target = pair.target.for_gicp(GICP_TARGET, pair.edge, pair.threads)
-    T = gicp_in_reach(pair, pair.source.fine(GICP_SOURCE, pair.edge), target, T_target_source)
-    T = by_smoothed(pair, T) if noisy(pair) else T
+    s, target = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.for_gicp(GICP_TARGET, pair.edge, pair.threads)
+    T = gicp_in_reach(pair, s, target, T_target_source)
+    t, edge, any_motion = pair.target.fine(GICP_TARGET, pair.edge), pair.edge, np.eye(6)
+    if noisy(pair):
+        clean_source, clean_target = (roughness < CLEAN for roughness, _ in roughnesses(pair))
+        if clean_target:  # onto a clean scan's own planes, which smoothing would bend
+            T = constrained(s, t, T, edge, any_motion, False)
+        elif clean_source:
+            T = np.linalg.inv(constrained(t, s, np.linalg.inv(T), edge, any_motion, False))
+        else:
+            T = by_smoothed(pair, T, s, t)
     planes = pair.flat_planes
     return T if planes is None else within_plane(T, *planes)
 
@@ -133,19 +141,22 @@ def noisy(pair: Pair) -> bool:
 
     Not where they are so sparse that their neighbourhoods show its shape: wider ones would cut its corners.
     """
-    clouds = ((pair.source, GICP_SOURCE), (pair.target, GICP_TARGET))
-    found = [cloud.roughness(count, pair.edge, SMOOTHED_OVER) for cloud, count in clouds]
-    rough = [growth for roughness, growth in found if roughness > ROUGH]
+    rough = [growth for roughness, growth in roughnesses(pair) if roughness > ROUGH]
     return bool(rough) and max(rough) < NOISE_GROWTH
 
 
-def by_smoothed(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+def roughnesses(pair: Pair) -> list[tuple[float, float]]:
+    """Of source and target, see ``geometry.smoothing.roughness``."""
+    clouds = ((pair.source, GICP_SOURCE), (pair.target, GICP_TARGET))
+    return [cloud.roughness(count, pair.edge, SMOOTHED_OVER) for cloud, count in clouds]
+
+
+def by_smoothed(pair: Pair, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """The pose after point-to-plane steps between points put onto planes through many neighbours.
 
     Noise averages out over a neighbourhood; points are put onto planes rather than averaged, so that two samplings of
     one surface stay on it. On clean scans so wide a plane would cut corners, and GICP is as exact.
     """
-    source, target = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge)
     source = local_planes(source, cKDTree(source), SMOOTHED_OVER)[0]
     target, normals, _ = local_planes(target, cKDTree(target), SMOOTHED_OVER)
     tree, T = cKDTree(target), T_target_source

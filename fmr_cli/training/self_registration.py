@@ -19,7 +19,7 @@ from fmr_cli.cores import usable_cores
 from fmr_cli.errors import FmrError
 from fmr_cli.geometry.frames import leave_frames
 from fmr_cli.multiway.candidates import look_at_pairs
-from fmr_cli.multiway.consistency import AGREE
+from fmr_cli.multiway.claims import AGREE
 from fmr_cli.multiway.known import Known
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement

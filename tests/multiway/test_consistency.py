@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from fmr_cli.multiway.consistency import joined
@@ -94,6 +95,20 @@ def test_a_wrong_link_made_first_is_outvoted():
     links = [link(1, 0, 0.9), link(2, 1, 0.9), link(2, 0, 0.9), link(3, 1, 0.9), link(3, 2, 0.9), wrong]
     found, _ = components(4, links)
     assert members(found) == [[0, 1, 2, 3]]
+    assert found[0].right
+
+
+def test_of_two_links_that_contradict_each_other_and_are_as_sure_neither_joins():
+    """Scan 0 hangs on one link alone, which was taken first; another one has it elsewhere: nothing tells which errs."""
+    ring = [link(2, 1, 0.99), link(3, 2, 0.99), link(4, 3, 0.99), link(4, 1, 0.99)]
+    found, apart = components(5, [*ring, link(1, 0, 0.99), link(3, 0, 0.99, right=None)])
+    assert members(found) == [[1, 2, 3, 4], [0]]
+    assert found[0].right
+    assert apart[0, 1].probability == pytest.approx(0.5)
+    found, _ = components(5, [*ring, link(1, 0, 0.99), link(3, 0, 0.6, right=None)])
+    assert members(found) == [[0, 1, 2, 3, 4]], "one is far surer than the other"
+    found, _ = components(5, [*ring, link(1, 0, 0.99), link(2, 0, 0.99), link(3, 0, 0.99, right=None)])
+    assert members(found) == [[0, 1, 2, 3, 4]], "two against one"
     assert found[0].right
 
 

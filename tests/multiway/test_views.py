@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rooms import room_views
@@ -40,6 +42,14 @@ def test_a_scan_sees_through_another_one_only_at_a_wrong_pose(pair):
     wrong = T.copy()
     wrong[:3, 3] += truth[1][:3, :3].T @ [0.8, 0.0, 0.0]
     assert visibility.compare(*views, wrong).contradiction > 2
+
+
+def test_what_a_scan_is_too_sparse_to_see_through_is_no_agreement(pair):
+    ready, truth, views = pair
+    T = enter_frames(np.linalg.inv(truth[1]) @ truth[0], ready[0].frame, ready[1].frame)
+    sparse = replace(views[1], count=np.minimum(views[1].count, visibility.SEEN - 1))
+    assert visibility.seen_by(views[1], views[0], T, 4000).agreeing > 500
+    assert visibility.seen_by(sparse, views[0], T, 4000) == visibility.Seen(0, 0, 0)
 
 
 def test_rooms_back_to_back_share_a_wall_but_not_a_side_of_it(pair):
