@@ -147,11 +147,17 @@ def runners_up(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.
     rows = np.flatnonzero(apart[np.arange(len(p)), behind[0]] < tolerance)
     columns = np.flatnonzero(apart[behind[1], np.arange(len(q))] < tolerance)
     similarity = np.where(apart < ELSEWHERE * pair.edge, -1.0, similarity)
-    forth = np.argsort(-similarity[rows], axis=1, kind="stable")[:, :RUNNERS_UP]
-    back = np.argsort(-similarity[:, columns], axis=0, kind="stable")[:RUNNERS_UP].T
+    forth, back = most_alike(similarity[rows]), most_alike(similarity[:, columns].T)
     i = np.concatenate([np.repeat(rows, forth.shape[1]), back.ravel()])
     j = np.concatenate([forth.ravel(), np.repeat(columns, back.shape[1])])
     return p[i], q[j]
+
+
+def most_alike(similarity: np.ndarray) -> np.ndarray:
+    """The columns of the RUNNERS_UP greatest of each row, greatest first."""
+    count = min(RUNNERS_UP, similarity.shape[1])
+    some = np.sort(np.argpartition(-similarity, count - 1, axis=1)[:, :count], axis=1)
+    return np.take_along_axis(some, np.argsort(-np.take_along_axis(similarity, some, 1), axis=1, kind="stable"), 1)
 
 
 def distances_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:

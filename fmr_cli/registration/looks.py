@@ -64,16 +64,17 @@ def further(
 
 
 def from_given(judge: Judge, init: Any, time: Stopwatch) -> Judge:
-    """A pose that is given, as it is; where that does not fit, where the paper's solver goes from it."""
+    """A pose that is given; where that does not fit, also where patches and the paper's solver go from it."""
     pair, name = judge.pair, init if isinstance(init, str) else "given"
     T = np.eye(4) if isinstance(init, str) else np.asarray(init, float)
     T = T if name == "centroid" else pair.enter_centred(T)  # the centred identity brings centroid onto centroid
     consider(judge, hypotheses.from_pose(pair, T, name), time)
     if not judge.sure(SURE):
         with time.stage("solve"):
-            found = hypotheses.from_solver(pair, T, name)
-        consider(judge, found, time)
-        judge.candidates = [c if c.errors else replace(c, errors=found[0].errors) for c in judge.candidates]
+            patches = refinement.by_patches(pair, pair.motion.exact(T), refinement.LEVELS)
+            solved = hypotheses.from_solver(pair, T, name)
+        consider(judge, [*hypotheses.from_pose(pair, patches, name), *solved], time)
+        judge.candidates = [c if c.errors else replace(c, errors=solved[0].errors) for c in judge.candidates]
     if not judge.candidates:
         judge.consider(T, name, [])
     return judge

@@ -43,7 +43,7 @@ COMMON = 0.25  # spacings, within which most points have their counterpart if th
 def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
     """The pose that a hypothesis leads to, near enough to be judged; cheap, so that many can be."""
     T = pair.motion.exact(hypothesis.T_target_source)
-    if hypothesis.start not in ("features", "rival"):  # these are near already
+    if hypothesis.errors:  # where the global feature leads to is only roughly right
         T = by_patches(pair, T, LEVELS)
     if not pair.options.refine:
         return T if hypothesis.errors else by_patches(pair, T, FINE)
