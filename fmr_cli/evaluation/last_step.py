@@ -139,7 +139,8 @@ def at_level(
 def samples(clouds: Clouds | None, experiment: str, points: int, rng: np.random.Generator) -> TwoSamples:
     """Two samples of a made-up scene, or of one of the clouds (whose normals are those of all its points)."""
     if clouds is None:
-        return (near_pairs.two_sensors if experiment == TWO_SENSORS else near_pairs.made_up)(rng, points)
+        make = near_pairs.two_sensors if experiment == TWO_SENSORS else near_pairs.made_up
+        return next(drawn for drawn in iter(lambda: make(rng, points), None) if drawn.determined)
     cloud = clouds.points[int(rng.integers(len(clouds.points)))].double().cpu().numpy()
     normals = normals_and_variation(cloud, *neighbours(cloud, cKDTree(cloud)))[0]
     return near_pairs.halves(cloud, normals, points, rng)

@@ -14,6 +14,7 @@ from fmr_cli.synthetic import scenes, sensors
 
 START_DEGREES, START_SHIFT = 3.0, 0.02  # of the start, at most; of the size
 SEEN_BY_BOTH = 2.0  # spacings of the target, within which a point of the source counts as seen by both
+DETERMINED = 1e-4  # of the most information about a direction, the least: a pair whose pose nothing tells is no test
 BOX = 1.1  # times the cloud's bounding box: where outliers are
 
 
@@ -32,6 +33,23 @@ class TwoSamples:
     def size(self) -> float:
         """The largest extent."""
         return float(np.ptp(self.target, axis=0).max())
+
+    @property
+    def common(self) -> np.ndarray:
+        """Which of the source's points both saw: (N,)."""
+        tree = cKDTree(self.target)
+        reach = SEEN_BY_BOTH * float(np.median(tree.query(self.target[::10], 2)[0][:, 1]))
+        return np.isfinite(tree.query(self.source, distance_upper_bound=reach)[0])
+
+    @property
+    def determined(self) -> bool:
+        """Whether what both saw determines a pose in all directions."""
+        points, normals = self.source[self.common] / self.size, self.normals[self.common]
+        if not len(points):
+            return False
+        J = np.hstack([np.cross(points - points.mean(0), normals), normals])
+        least, *_, most = np.linalg.eigvalsh(J.T @ J)
+        return bool(least > DETERMINED * most)
 
 
 @dataclass(frozen=True)
@@ -121,9 +139,7 @@ def near_pair(samples: TwoSamples, how: Degraded, rng: np.random.Generator) -> N
     axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turn = Rotation.from_rotvec(np.radians(rng.uniform(0, START_DEGREES)) * axis)
     off = rigid(turn, centre - turn.apply(centre) + way * rng.uniform(0, START_SHIFT * size))
-    tree = cKDTree(samples.target)
-    reach = SEEN_BY_BOTH * float(np.median(tree.query(samples.target[::10], 2)[0][:, 1]))
-    common = np.isfinite(tree.query(true[:inliers], distance_upper_bound=reach)[0])
+    common = samples.common[keep][:inliers]
     ratio = inliers / ((1 - how.outliers) * len(samples.target))
     return NearPair(
         transform_points(np.linalg.inv(T), source), target, T, off @ T, size, true[:inliers][common],

@@ -13,7 +13,7 @@ from fmr_cli.evaluation.catalogue import EXPERIMENTS
 from fmr_cli.evaluation.cramer_rao import information, median_rotation
 from fmr_cli.evaluation.experiments import Clouds
 from fmr_cli.geometry.se3 import exp, log
-from fmr_cli.synthetic.near_pairs import Degraded, near_pair
+from fmr_cli.synthetic.near_pairs import Degraded, TwoSamples, near_pair
 from fmr_cli.synthetic.shapes import others
 
 
@@ -62,6 +62,14 @@ def test_the_error_is_about_the_middle_and_in_sizes() -> None:
     twist = log(exp(np.array([0, 0, np.radians(2), 0, 0.5, 0])))
     assert shift == pytest.approx(0.1, rel=1e-3)
     assert rmse == pytest.approx(np.sqrt((np.append(twist[:3], twist[3:] / 5.0) ** 2).mean()), rel=1e-6)
+
+
+def test_pairs_whose_pose_nothing_tells_are_no_test() -> None:
+    points, normals = body(np.random.default_rng(0), 2000)
+    assert TwoSamples(points, points, normals).determined
+    top = normals[:, 2] > 0
+    assert not TwoSamples(points[top], points[top], normals[top]).determined, "a plane"
+    assert not TwoSamples(points + 100, points, normals).determined, "nothing in common"
 
 
 def test_every_step_comes_nearer_on_clean_scans() -> None:
