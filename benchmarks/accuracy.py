@@ -79,6 +79,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=12_288, help="of a cloud made here, at most of a file")
     parser.add_argument("--pairs", type=int, default=40, help="of each protocol and set of clouds")
     parser.add_argument("--only", default=",".join(PROTOCOLS), help="protocols, comma-separated")
+    parser.add_argument("--methods", help="those whose name has this in it")
     parser.add_argument("--voxel-size", type=float, default=0.05, help="the peers', in the clouds' unit")
     parser.add_argument("--seed", type=int, default=40_000)
     parser.add_argument("--out", type=Path, help="write OUT.json and OUT.png")
@@ -93,7 +94,8 @@ def main() -> None:
             "rooms": room_clouds(count, args.points, args.seed),
             "objects": shape_clouds(count, args.points, args.seed),
         }
-    methods, rows = ways(args.voxel_size, 4 * args.voxel_size), []
+    methods = {n: way for n, way in ways(args.voxel_size, 4 * args.voxel_size).items() if (args.methods or "") in n}
+    rows: list[dict[str, Any]] = []
     for name, clouds in sets.items():
         console.print(f"{name}: {len(clouds)} clouds of {np.median([len(c) for c in clouds]):,.0f} points")
         for protocol in args.only.split(","):

@@ -68,9 +68,10 @@ def text_examples() -> list[Example]:
         ("text: blanks or tabs", "blanks.xyz", plain),
         ("text: blanks or tabs", "tabs.txt", lines("\t")),
         ("text: blanks or tabs", "mixed.asc", lines(" \t ")),
-        ("text: commas, semicolons, bars", "commas.csv", csv),
-        ("text: commas, semicolons, bars", "semicolons.txt", lines(";")),
-        ("text: commas, semicolons, bars", "bars.txt", lines("|")),
+        ("text: commas, semicolons, bars, colons", "commas.csv", csv),
+        ("text: commas, semicolons, bars, colons", "semicolons.txt", lines(";")),
+        ("text: commas, semicolons, bars, colons", "bars.txt", lines("|")),
+        ("text: commas, semicolons, bars, colons", "colons.txt", "x:y:z\n" + lines(":")),
         ("text: decimal comma", "decimal.csv", lines(";", decimal=",")),
         ("text: decimal comma", "decimal_tabs.txt", lines("\t", decimal=",")),
         ("text: decimal comma", "decimal_blanks.txt", lines(" ", decimal=",")),
@@ -82,7 +83,8 @@ def text_examples() -> list[Example]:
         ("text: names in the first line", "german.csv", "Rechtswert;Hochwert;H\u00f6he\n" + lines(";", decimal=",")),
         ("text: names in the first line", "report.txt", "Project: a\nDate: 2020\nX Y Z\n" + plain),
         ("text: a count in the first line", "count.xyz", f"{COUNT}\n" + plain),
-        ("text: comments by # % // ;", "comments.txt", "% a\n# b\n// c\n; d\n" + plain),
+        ("text: comments by # % // ; ! ' REM -- *", "comments.txt", "% a\n# b\n// c\n; d\n" + plain),
+        ("text: comments by # % // ; ! ' REM -- *", "basic.txt", "REM a\n' b\n! c\n-- d\n* e\n" + plain),
         ("text: Fortran exponents", "fortran.txt", "".join(
             " ".join(f"{v:.12E}".replace("E", "D") for v in p) + "\n" for p in P
         )),
@@ -164,6 +166,8 @@ def ply_examples() -> list[Example]:
         Example("PLY: line ends LF, CR LF, CR", "crlf.ply", ply("ascii", xyz, text).replace(b"\n", b"\r\n")),
         Example("PLY: comments of several lines", "comments.ply",
                 ply("ascii", xyz, text, "comment made by\n a program\nobj_info x\n")),
+        Example("PLY, PCD: comments among the points of ascii", "among.ply",
+                ply("ascii", xyz, text.replace(b"\n", b"\ncomment x\n# y\n", 2))),
         Example("PLY: colours, normals, any property", "colors.ply",
                 ply("binary_little_endian", [*xyz, *(f"uchar {c}" for c in COLORS), "float quality"],
                     records("<", *floats, *(("u1", c) for c in RGB.T), ("f4", I))), (*COLORS, "quality")),
@@ -203,6 +207,8 @@ def pcd_examples() -> list[Example]:
         Example("PCD: ascii", "ascii.pcd", pcd(xyz, sizes, kinds, "ascii", text)),
         Example("PCD: ascii", "commas.pcd", pcd(xyz, sizes, kinds, "ascii", lines(",").encode())),
         Example("PCD: ascii", "comma_blank.pcd", pcd(xyz, sizes, kinds, "ascii", lines(", ").encode())),
+        Example("PLY, PCD: comments among the points of ascii", "among.pcd",
+                pcd(xyz, sizes, kinds, "ascii", b"# x\n" + text.replace(b"\n", b"\n# y\n", 2))),
         Example("PCD: binary", "binary.pcd", pcd(xyz, sizes, kinds, "binary", body)),
         Example("PCD: binary_compressed", "packed.pcd",
                 pcd("x y z i", "4 4 4 4", "F F F F", "binary_compressed", compressed), ("intensity",)),
@@ -273,16 +279,20 @@ def bin_examples() -> list[Example]:
 
     nclt = np.zeros(n, [("xyz", "<u2", 3), ("i", "u1"), ("ring", "u1")])
     nclt["xyz"], nclt["ring"] = np.rint((xyz.astype(float) + 100) / 0.005), ring
-    four, rest = ".bin: 4 float32 (KITTI)", ".bin: 3, 5, 6, 7 or 8 float32"
+    four, rest = ".bin: 4 float32 (KITTI)", ".bin: 3, or 5 to 10 float32"
     return [
         Example(four, "kitti.bin", packed(("f4", share)), ("intensity",)),
         Example(rest, "three.bin", packed()),
         Example(rest, "nuscenes.bin", packed(("f4", colors[:, 0]), ("f4", ring)), ("intensity", "ring")),
         Example(rest, "six.bin", packed(*(("f4", c) for c in colors.T)), COLORS),
         Example(rest, "seven.bin", packed(*(("f4", c) for c in colors.T), ("f4", share)), (*COLORS, "intensity")),
+        Example(rest, "ten.bin", packed(("f4", share), *(("f4", c) for c in np.tile([[0.0], [0.6], [0.8]], n)),
+                                        *(("f4", c) for c in colors.T)), ("intensity", *NORMALS, *COLORS)),
         Example(rest, "time.bin", packed(("f4", share), ("f4", ring), ("f4", time)), ("intensity", "ring", "time")),
         Example(".bin: with uint32, uint16, float64", "whole.bin", packed(("f4", share), ("u4", ring)),
                 ("intensity", "ring")),
+        Example(".bin: with uint32, uint16, float64", "color.bin",
+                packed(("u4", colors @ [1 << 16, 1 << 8, 1] + (255 << 24))), ("color",)),
         Example(".bin: with uint32, uint16, float64", "velodyne.bin", packed(("f4", share), ("u2", ring), ("f4", time)),
                 ("intensity", "ring", "time")),
         Example(".bin: with uint32, uint16, float64", "doubles.bin", np.hstack([xyz, share[:, None]]).tobytes(),

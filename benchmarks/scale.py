@@ -2,7 +2,7 @@
 
     python -m benchmarks.scale workers     # pairs of 12,000 points, in turn by 1, 2, 4 processes and Dask workers
     python -m benchmarks.scale scheduler   # 100, 1,000, 10,000 tasks that carry the messages of a pair, and do nothing
-    python -m benchmarks.scale pairs       # 100 and 1,000 real pairs of 1,000 points, by two processes
+    python -m benchmarks.scale pairs       # 100, 1,000, 10,000 real pairs of small clouds by Dask, and by processes
     python -m benchmarks.scale paper       # a million pairs on 1,000 cores, from the figures that the others left
 
 Figures go to --out (scale.json), which each run adds to. Pairs are halves of made-up rooms that share 80 %. Seconds of
@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import pickle
 import tempfile
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ import numpy as np
 import psutil
 
 from benchmarks.common import make_pair, room_clouds, show
-from fmr_cli import PointCloud, write_cloud
+from fmr_cli import PointCloud, align, write_cloud
 from fmr_cli.batch import align_batch
 from fmr_cli.batch.cache import CloudCache
 from fmr_cli.batch.manifest import Pair, read_manifest
@@ -39,32 +40,76 @@ from fmr_cli.workers import DaskWorkers
 MILLION, CORES = 1_000_000, 1_000
 
 
-def write_pairs(folder: Path, count: int, points: int, different: int = 40) -> Path:
-    """A manifest of so many pairs of ``points`` points each; files of ``different`` pairs, again and again."""
-    lines = ["source,target"]
-    for number, cloud in enumerate(room_clouds(min(count, different), 5 * points // 2, 0)):
+def room_pairs(count: int, points: int) -> list[tuple[PointCloud, PointCloud]]:
+    """So many pairs of ``points`` points each, each of another room."""
+    pairs = []
+    for number, cloud in enumerate(room_clouds(count, 5 * points // 2, 0)):
         source, target, _ = make_pair("overlap80", cloud, np.random.default_rng((1, number)))
-        for name, side in (("s", source), ("t", target)):
-            write_cloud(folder / f"{number}_{name}.ply", PointCloud(side[:points]))
-    lines += [f"{n % different}_s.ply,{n % different}_t.ply" for n in range(count)]
+        pairs.append((PointCloud(source[:points]), PointCloud(target[:points])))
+    return pairs
+
+
+def quickest(pairs: list[tuple[PointCloud, PointCloud]], count: int) -> list[tuple[PointCloud, PointCloud]]:
+    """So many of the pairs, those that ``align`` needs the least of the processor for: its first look is sure."""
+    seconds = []
+    for pair in pairs:
+        begin = time.process_time()
+        align(*pair, threads=1)
+        seconds.append(time.process_time() - begin)
+    return [pairs[n] for n in np.argsort(seconds)[:count]]
+
+
+def write_pairs(folder: Path, count: int, pairs: list[tuple[PointCloud, PointCloud]]) -> Path:
+    """A manifest of so many pairs, every file read once: of these pairs, and of links to them under other names."""
+    for number in range(count):
+        for side, name in enumerate("st"):
+            path = folder / f"{number}_{name}.ply"
+            if number < len(pairs):
+                write_cloud(path, pairs[number][side])
+            else:
+                os.link(folder / f"{number % len(pairs)}_{name}.ply", path)
     path = folder / "pairs.csv"
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("source,target\n" + "".join(f"{number}_s.ply,{number}_t.ply\n" for number in range(count)))
     return path
 
 
-def throughput(manifest: Path, workers: int, dask: bool) -> dict[str, Any]:
-    """One run of a batch: its pairs a second from the first row to the last, seconds in all, CPU seconds a pair."""
+def first_of(manifest: Path, count: int) -> Path:
+    """A manifest beside this one with its first ``count`` pairs."""
+    path = manifest.with_name(f"first_{count}.csv")
+    path.write_text("".join(manifest.read_text().splitlines(keepends=True)[: count + 1]))
+    return path
+
+
+class EnoughError(Exception):
+    """The minutes that a run may take are over."""
+
+
+def throughput(manifest: Path, workers: int, dask: bool, minutes: float = np.inf) -> dict[str, Any]:
+    """One run of a batch: its pairs a second from the first row to the last, seconds in all, CPU seconds a pair.
+
+    minutes: after which it is cut off, as by Ctrl-C. cpu ms at this end: of the processor, what the command's process
+    takes a pair: it hands out and writes; with Dask it is the scheduler too. bytes a pair: over this machine's
+    loopback, which other programs may use as well.
+    """
     told: list[float] = []
+
+    def on_row(row: dict[str, Any], done: int, total: int) -> None:
+        assert row["status"] != "failed", row["message"]
+        told.append(time.perf_counter())
+        if told[-1] - begin > 60 * minutes:
+            raise EnoughError
+
     with tempfile.TemporaryDirectory() as out, ExitStack() as stack:
-        begin, before = time.perf_counter(), cpu_seconds()
+        begin, before, here, sent = time.perf_counter(), cpu_seconds(), time.process_time(), loopback()
         team = stack.enter_context(DaskWorkers("local", workers, lambda _: None)) if dask else workers
-        rows = align_batch(
-            manifest, Path(out) / "out", workers=team, on_row=lambda *_: told.append(time.perf_counter())
-        )
+        with suppress(EnoughError):
+            align_batch(manifest, Path(out) / "out", workers=team, on_row=on_row)
         took, cpu = time.perf_counter() - begin, cpu_seconds() - before
-    rate = (len(rows) - 1) / (told[-1] - told[0])
-    return {"by": f"{workers} {'Dask workers' if dask else 'processes'}", "pairs": len(rows), "pairs/s": rate,
-            "s in all": took, "cpu s a pair": cpu / len(rows)}  # fmt: skip
+        here, sent = time.process_time() - here, loopback() - sent
+    count = len(told)
+    return {"by": f"{workers} {'Dask workers' if dask else 'processes'}", "pairs": len(read_manifest(manifest)),
+            "done": count, "pairs/s": (count - 1) / (told[-1] - told[0]), "s in all": took, "cpu s a pair": cpu / count,
+            "cpu ms at this end": 1000 * here / count, "bytes a pair": sent / count if dask else None}  # fmt: skip
 
 
 def in_turn(manifest: Path, workers: list[int], repeat: int) -> list[dict[str, Any]]:
@@ -186,30 +231,40 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--tasks", type=int, nargs="+", default=[100, 1_000, 10_000])
-    parser.add_argument("--counts", type=int, nargs="+", default=[100, 1_000])
+    parser.add_argument("--counts", type=int, nargs="+", default=[100, 1_000, 10_000])
+    parser.add_argument("--small", type=int, default=1_000, help="points of a cloud of ``pairs``")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="of ``pairs``, after which a run is cut off")
+    parser.add_argument("--both", type=int, default=1_000, help="pairs from which on Dask alone does them")
     parser.add_argument("--out", type=Path, default=Path("scale.json"))
     given = parser.parse_args()
     found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.exists() else {}
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         if given.what == "workers":
-            manifest = write_pairs(folder, given.pairs, given.points)
+            manifest = write_pairs(folder, given.pairs, room_pairs(given.pairs, given.points))
             found["workers"] = in_turn(manifest, given.workers, given.repeat)
             show(f"{given.pairs} pairs of {given.points} points, {given.repeat} times", found["workers"])
             for line in compared(found["workers"]):
                 print(line)
         elif given.what == "pairs":
-            found["pairs"] = [throughput(write_pairs(folder, n, 1_000), 2, False) for n in given.counts]
-            show("pairs of 1,000 points", found["pairs"])
+            manifest = write_pairs(folder, max(given.counts), quickest(room_pairs(24, given.small), 4))
+            done = {(row["by"], row["pairs"]): row for row in found.get("pairs", [])}  # the last of each stays
+            for count in given.counts:
+                for dask in (True, False) if count <= given.both else (True,):
+                    row = throughput(first_of(manifest, count), 2, dask, given.minutes)
+                    done[row["by"], count] = row | {"points": given.small}
+                    found["pairs"] = list(done.values())
+                    write_json(given.out, found)  # the larger ones take long
+            show(f"pairs of {given.small} points", found["pairs"])
         elif given.what == "scheduler":
-            runner, pair, done = one_done(folder, write_pairs(folder, 1, given.points))
+            runner, pair, done = one_done(folder, write_pairs(folder, 1, room_pairs(1, given.points)))
             found["scheduler"] = [scheduler_cost(n, runner, pair, done) for n in given.tasks]
             found["writing"] = writing_cost(folder, pair, done)
             show("tasks that carry a pair's messages, two workers", found["scheduler"])
             show("rows, transforms, metrics", [found["writing"]])
         else:
             show("a million pairs", on_paper(found))
-    given.out.write_text(json.dumps(found, indent=1) + "\n")
+    write_json(given.out, found)
 
 
 if __name__ == "__main__":

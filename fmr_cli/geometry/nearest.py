@@ -6,9 +6,7 @@ import numpy as np
 
 from fmr_cli.cores import usable_cores
 
-CELLS = 1 << 10  # along each side of the box, of the order in which points are looked up
-# Moves ten bits of a number apart, so that two others fit in between each two
-SPREAD = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
+BITS = 16  # of the order in which points are looked up: numbers of two bytes are sorted in one pass
 
 
 class NearestDistance:
@@ -36,9 +34,18 @@ class NearestDistance:
 
 
 def along_curve(points: np.ndarray) -> np.ndarray:
-    """The order of points (N, 3) along a Z-order curve through their bounding box."""
-    low, high = points.min(0), points.max(0)
-    cells = ((points - low) / np.maximum(high - low, 1e-300) * (CELLS - 1)).astype(np.uint32)
-    for shift, mask in SPREAD:
-        cells = (cells | cells << shift) & mask
-    return np.argsort(cells[:, 0] | cells[:, 1] << 1 | cells[:, 2] << 2)
+    """The order of points (N, 3) along a Z-order curve through their box, whose longest side is halved BITS times."""
+    low = points.min(0)
+    size = np.maximum(points.max(0) - low, 1e-300)
+    sides, turns = size.copy(), []
+    for _ in range(BITS):
+        turns.append(int(sides.argmax()))
+        sides[turns[-1]] /= 2
+    depth = [turns.count(axis) for axis in range(3)]
+    steps = [(points[:, k] - low[k]) * (((1 << depth[k]) - 0.5) / size[k]) for k in range(3)]
+    cells = [column.astype(np.uint16) for column in steps]
+    place = np.zeros(len(points), np.uint16)
+    for axis in turns:
+        depth[axis] -= 1
+        place = (place << 1) | ((cells[axis] >> depth[axis]) & 1)
+    return np.argsort(place, kind="stable")

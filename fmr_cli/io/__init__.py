@@ -14,7 +14,7 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.addresses import address_of, local, shown
-from fmr_cli.io.files import atomic_write, check_readable, reason, shortened
+from fmr_cli.io.files import atomic_write, check_readable, reason, refuse_other_kind, shortened
 from fmr_cli.io.mesh import Mesh
 from fmr_cli.io.parts import ScanPart, is_bag_folder, part_name, topic_of
 from fmr_cli.io.stream import CloudStream, Wanted, ahead, collect, stream_of
@@ -94,6 +94,7 @@ def open_cloud(
         points = dropped = 0
         with naming(file):
             here = local(file)
+            check_kind(here, file)
         for chunk in ahead(guarded(module.read(here, wanted), file)):
             if isinstance(chunk, Mesh):
                 with naming(file):
@@ -178,6 +179,7 @@ def scans_of(path: str | Path, topic: str | None = None) -> list[ScanPart]:
     check_scan(path)
     with naming(file):
         here = local(file)
+        check_kind(here, file)
         return module.scans(here, topic) if topic is not None else module.scans(here)
 
 
@@ -212,6 +214,14 @@ def check_there(file: Path) -> None:
     """Raises CloudFileError where there is no such file. What is elsewhere is asked for when it is read."""
     if address_of(file) is None and not is_bag_folder(file):
         check_readable(file)
+
+
+def check_kind(here: Path, file: Path) -> None:
+    """Raises CloudFileError where the first bytes tell of another kind than the suffix. here: the file or its copy."""
+    if here.is_file():
+        module = FORMATS[suffix_of(file)][0]
+        packed = (".gz",) if module == "text" else ()
+        refuse_other_kind(here, (*(suffix for suffix, (other, _) in FORMATS.items() if other == module), *packed))
 
 
 def write_cloud(path: str | Path, cloud: PointCloud | CloudStream) -> list[str]:
@@ -277,6 +287,11 @@ def parted(path: Path) -> tuple[Path, str]:
     return (path.with_name(path.name[:at]) if at else path), path.name[at + 1 :]
 
 
+def suffix_of(path: Path) -> str:
+    """The suffix that says the format, in small letters: of what is packed, that of what is in it."""
+    return (path.with_suffix("") if path.suffix.lower() == ".gz" else path).suffix.lower()
+
+
 def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str, Path, str | None]:
     """The module for a path's suffix, which must be among ``suffixes``, and the format's name; the file and its part.
 
@@ -287,12 +302,13 @@ def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str,
         path, part = parted(path)
     if suffixes is SUFFIXES and is_bag_folder(path):
         return importlib.import_module("fmr_cli.io.bags"), "bag", path, part
-    packed = path.suffix.lower() == ".gz"
-    suffix = path.with_suffix("").suffix.lower() if packed else path.suffix.lower()
-    full = f"{suffix}.gz" if packed else suffix
+    suffix = suffix_of(path)
+    full = f"{suffix}.gz" if path.suffix.lower() == ".gz" else suffix
     if full not in suffixes:
         if path.is_dir():
             raise CloudFileError(f"{path}: is a folder, give a file in it")
+        if suffixes is SUFFIXES and not path.exists():
+            raise CloudFileError(f"{shown(path)}: no such file, check the name")
         what = f"the suffix {full!r} cannot be {'read' if suffixes is SUFFIXES else 'written'}"
         raise CloudFileError(f"{shown(path)}: {what if full else 'has no suffix'}, use one of {' '.join(suffixes)}")
     module, kind = FORMATS[suffix]

@@ -1,6 +1,6 @@
 """.bin: numbers and nothing else.
 
-3 to 8 float32 a point (KITTI 4, nuScenes 5), some of them uint32; float64; records with a 2-byte ring as drivers pack
+3 to 10 float32 a point (KITTI 4, nuScenes 5), some of them uint32; float64; records with a 2-byte ring as drivers pack
 them; NCLT's 8 bytes a point. How many, and what they are, stands nowhere: it is told by the values, unless
 `Wanted.bin_columns` names them.
 """
@@ -17,8 +17,8 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import are_colors, bare_names, lost_context, native
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted
 
-WIDTHS = range(3, 9)  # numbers a point
-PERIOD = 840  # the least common multiple of the widths: samples that start at its multiples start with a point
+WIDTHS = range(3, 11)  # numbers a point
+PERIOD = 2520  # the least common multiple of the widths: samples that start at its multiples start with a point
 SAMPLES = 24  # of PERIOD numbers each, spread over the file
 BINS = 24
 # Of the information of the best width, in what column a number stands: a narrower one that comes as near is right,
@@ -90,7 +90,10 @@ def find_columns(path: Path, size: int) -> tuple[str, ...] | None:
         return columns_of(sample, size, "")
     if size % NCLT.itemsize == 0 and is_nclt(path):
         return None
-    found = [*wholes, *(c for c in PACKED if is_packed(path, size, c))]
+    found: list[tuple[str, ...]] = [columns for columns in PACKED if is_packed(path, size, columns)]
+    packed = [record_of(columns).itemsize for columns in found]
+    # Two records of another kind may look like one of many numbers
+    found += [columns for columns in wholes if all(record_of(columns).itemsize % width for width in packed)]
     if not found and size % 8 == 0 and plausible(doubles := sample_of(path, size, "<f8")):
         return columns_of(doubles, size, ":f8")
     if len(found) > 1:
@@ -116,7 +119,7 @@ def whole_numbers_among(sample: np.ndarray, size: int) -> list[tuple[str, ...]]:
         floats = all(plausible(column) for column in rows.T[~whole])
         if whole.any() and not whole[:3].any() and floats and (np.ptp(rows[:, :3], axis=0) > 0).all():
             values = np.where(whole, np.ascontiguousarray(rows).view("<u4"), rows.astype(np.float64))
-            names = name_columns(values[:, 3:])
+            names = name_columns(values[:, 3:], wide=bool(whole[3]))
             kinds = [":u4" if w else "" for w in whole[3:]]
             found.append(("x", "y", "z", *(name + kind for name, kind in zip(names, kinds, strict=True))))
     return found
@@ -160,7 +163,7 @@ def columns_of(sample: np.ndarray, size: int, kind: str) -> tuple[str, ...]:
     """
     fitting = [width for width in WIDTHS if size % (sample.itemsize * width) == 0]
     if not fitting:
-        raise CloudFileError(f"holds {size} bytes, which is no number of points of 3 to 8 float32: copy it again")
+        raise CloudFileError(f"holds {size} bytes, which is no number of points of 3 to 10 float32: copy it again")
     width = find_width(sample, fitting)
     rows = sample[: len(sample) // width * width].reshape(-1, width)
     names = ["x", "y", "z", *name_columns(rows[np.isfinite(rows).all(1), 3:])]
@@ -198,33 +201,44 @@ def column_information(sample: np.ndarray, width: int) -> float:
     return float(np.nansum(terms) - (width - 1) * (used - 1) / (2 * rows.size))
 
 
-def name_columns(extra: np.ndarray) -> list[str]:
-    """What the numbers after x y z are: intensity first, small integers a ring, what rises a time; colours, normals."""
+def name_columns(extra: np.ndarray, wide: bool = False) -> list[str]:
+    """What the numbers after x y z are: intensity first, small integers a ring, what rises a time; colours, normals.
+
+    wide: whether the first is an uint32.
+    """
     count = extra.shape[1]
-    names = bare_names(extra) if count >= 3 else []
+    names = bare_names(extra) if count >= 3 and not wide else []
     if names and not names[0].startswith("column_"):
         return names
     if count > 3 and are_colors(extra[:, :3]) and (extra[:, :3].max(0) > 127).all():
         return [*COLORS, *name_singly(extra[:, 3:], 7)]
     if count == 3 and ((extra >= 0) & (extra <= 1)).all() and not any(map(rises, extra.T)):
         return [*COLORS]
-    return name_singly(extra, 4)
+    return name_singly(extra, 4, wide)
 
 
-def name_singly(extra: np.ndarray, first: int) -> list[str]:
-    """Names of single columns, the first of which is the file's ``first``, from 1."""
+def name_singly(extra: np.ndarray, first: int, wide: bool = False) -> list[str]:
+    """Names of single columns, the first of which is the file's ``first``, from 1, and an uint32 if ``wide``."""
     names: list[str] = []
     for k, column in enumerate(extra.T):
         whole = bool(len(column) and (column == np.rint(column)).all() and column.min() >= 0)
-        if k == 0:
+        if k == 0 and not wide:
             names.append("intensity")
         elif whole and column.max() < RINGS and "ring" not in names:
             names.append("ring")
         elif rises(column) and "time" not in names:
             names.append("time")
+        elif k == 0 and packs_color(column):
+            names.append("color")
         else:
-            names.append(f"column_{first + k}")
+            names.append(f"column_{first + k}" if k else "intensity")
     return names
+
+
+def packs_color(column: np.ndarray) -> bool:
+    """Whether whole numbers are three bytes of a colour and an opacity; in which order, no value says."""
+    opacity, rest = column.astype(np.uint32) >> 24, column.astype(np.uint32) & 0xFFFFFF
+    return bool(len(column) and np.ptp(opacity) == 0 and opacity[0] in (0, 255) and (rest > 0xFFFF).mean() > 0.2)
 
 
 def rises(column: np.ndarray) -> bool:

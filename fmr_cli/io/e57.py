@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import Field, fields_of, lost_context, storable, unique
+from fmr_cli.io.files import reason
 from fmr_cli.io.parts import ScanPart, choose, proper
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
 
@@ -46,12 +48,25 @@ def library() -> Any:
 
 def scans(path: Path) -> list[ScanPart]:
     """Name, pose and number of points of each scan."""
-    lib = library()
-    file = lib.ImageFile(str(path), "r")
-    try:
+    with opened(library(), path) as file:
         return [part_of(scan, k) for k, scan in enumerate(scan_nodes(file))]
+
+
+@contextmanager
+def opened(lib: Any, path: Path) -> Iterator[Any]:
+    """The file, closed at the end. Raises CloudFileError for what libe57 says of it, of which the first sentence."""
+    file = None
+    try:
+        file = lib.ImageFile(str(path), "r")
+        yield file
+    except CloudFileError:
+        raise
+    except Exception as error:
+        what = reason(error).partition(" (Error")[0].partition(" ****")[0]
+        raise CloudFileError(f"is damaged or truncated ({what}): copy it again") from error
     finally:
-        file.close()
+        if file is not None:
+            file.close()
 
 
 def scan_nodes(file: Any) -> list[Any]:
@@ -87,8 +102,7 @@ def pose_of(scan: Any) -> np.ndarray:
 def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
     """All scans after each other, or the one that is wanted. Of several, ``scan`` numbers them from 1."""
     lib = library()
-    file = lib.ImageFile(str(path), "r")
-    try:
+    with opened(lib, path) as file:
         nodes = scan_nodes(file)
         parts = [part_of(scan, k) for k, scan in enumerate(nodes)]
         if not parts:
@@ -115,8 +129,6 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
                     transform_points(part.T_file_scan, xyz), kept, crs=crs or None, left_out=tuple(left_out),
                     sensor_origin=part.T_file_scan[:3, 3], scan=part.name, T_file_scan=part.T_file_scan,
                 )  # fmt: skip
-    finally:
-        file.close()
 
 
 def fields_in(lib: Any, scan: Any) -> dict[str, tuple[str, np.dtype]]:

@@ -15,6 +15,18 @@ from fmr_cli.errors import CloudFileError
 
 TEMPORARY = re.compile(r"\..*\.(?P<host>\w+)-(?P<pid>[0-9]{1,9})-[0-9a-f]{8}\.tmp(\..*)?")  # a temporary's name
 DAY = 86_400  # seconds
+HEAD = 64  # bytes
+# How files of some kinds begin, their suffixes, what they are
+MAGIC = (
+    (b"ply\n", (".ply",), "a PLY"), (b"ply\r", (".ply",), "a PLY"), (b"# .PCD", (".pcd",), "a PCD"),
+    (b"LASF", (".las", ".laz"), "a LAS or LAZ"), (b"ASTM-E57", (".e57",), "an E57"),
+    (b"\x93NUMPY", (".npy",), "a NPY"), (b"#ROSBAG", (".bag",), "a bag of ROS 1"),
+    (b"SQLite format 3\0", (".db3",), "a bag of ROS 2 (SQLite)"), (b"\x89MCAP", (".mcap",), "an MCAP"),
+    (b"PK\x03\x04", (".zip", ".npz"), "a ZIP archive"), (b"\x1f\x8b\x08", (".gz",), "packed by gzip"),
+    (b"7z\xbc\xaf\x27\x1c", (".7z",), "a 7z archive"), (b"Rar!\x1a\x07", (".rar",), "a RAR archive"),
+    (b"\xfd7zXZ\0", (".xz",), "packed by xz"), (b"\x28\xb5\x2f\xfd", (".zst",), "packed by zstd"),
+)  # fmt: skip
+PACKERS = (".zip", ".gz", ".7z", ".rar", ".xz", ".zst")
 LONGEST_MESSAGE = 550  # characters, but for the file's name
 
 
@@ -32,6 +44,21 @@ def check_readable(path: Path) -> int:
     if size == 0:
         raise CloudFileError(f"{path}: is empty, write or copy it again")
     return size
+
+
+def refuse_other_kind(path: Path, suffixes: tuple[str, ...]) -> None:
+    """Raises CloudFileError where a file's first bytes say that it is of another kind than ``suffixes``."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    start = head.lstrip(b"\xef\xbb\xbf \r\n\t").lower()
+    if start.startswith(b"version https://git-lfs"):
+        raise CloudFileError("is a pointer of Git LFS and not the file itself: get it by `git lfs pull`")
+    if start.startswith((b"<!doctype html", b"<html")):
+        raise CloudFileError("is a web page, as where a download needs a login: download the file again")
+    for magic, kinds, what in MAGIC:
+        if head.startswith(magic) and not {*kinds} & {*suffixes}:
+            do = "unpack it first" if kinds[0] in PACKERS else f"give it the suffix {kinds[0]}"
+            raise CloudFileError(f"is {what} by its first bytes: {do}")
 
 
 def check_writable(path: Path) -> None:

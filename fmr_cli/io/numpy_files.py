@@ -84,7 +84,7 @@ def as_rows(array: np.ndarray) -> np.ndarray:
         return array.reshape(-1, shape[2])  # a range image, or a batch of clouds
     if len(shape) == 3 and shape[0] == 3:
         return array.reshape(3, -1).T
-    if len(shape) != 2 or min(shape) < 3:
+    if len(shape) != 2 or shape[1] < 3 > shape[0] or (min(shape) < 3 and shape[1] != 3):
         raise CloudFileError(f"holds an array of {shape}, points need (N, 3) numbers or more columns")
     refuse_poses(array[:HEAD])
     rows, columns = shape

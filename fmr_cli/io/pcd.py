@@ -22,7 +22,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import Field, fields_of, storable, to_cloud, unique
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Survey, Wanted
-from fmr_cli.io.table import MOST_COLUMNS, Lines, beyond, read_rows
+from fmr_cli.io.table import AMONG_POINTS, MOST_COLUMNS, Lines, beyond, read_rows
 
 LONGEST_HEADER = 1 << 20
 LINE_END = re.compile(rb"\r\n|\n|\r")
@@ -64,7 +64,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
             )
         text = None
         if header.encoding == "ascii":
-            text = Lines(stack.enter_context(TextIOWrapper(file, "utf-8", errors="replace")), header.lines)
+            lines = stack.enter_context(TextIOWrapper(file, "utf-8", errors="replace"))
+            text = Lines(lines, header.lines, AMONG_POINTS)
         for records in records_of(file, text, header):
             cloud = cloud_of(records, header, wanted.attributes)
             yield cloud

@@ -20,7 +20,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.io.fields import fields_of, storable, to_cloud, unique, write_records
 from fmr_cli.io.mesh import Mesh, fan
 from fmr_cli.io.stream import CHUNK, COLORS, CloudStream, Wanted, collect
-from fmr_cli.io.table import MOST_COLUMNS, Lines, beyond, read_rows
+from fmr_cli.io.table import AMONG_POINTS, MOST_COLUMNS, Lines, beyond, read_rows
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -87,7 +87,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud | Mesh]:
         context = context_of(header)
         text = None
         if not header.order:
-            text = Lines(stack.enter_context(TextIOWrapper(file, "utf-8", errors="replace")), header.lines)
+            lines = stack.enter_context(TextIOWrapper(file, "utf-8", errors="replace"))
+            text = Lines(lines, header.lines, AMONG_POINTS)
         corners = None
         vertices: list[PointCloud] = []
         colors: dict[str, np.ndarray] = {}

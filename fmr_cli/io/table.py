@@ -22,7 +22,12 @@ MOST_COLUMNS = 10_000  # of a point; each costs time, whether or not it holds an
 LONGEST_LINE = 1 << 20  # characters: a point has some hundred at most
 BLOCK = 1 << 22  # characters read at a time
 ROWS = CHUNK // 4  # lines parsed at a time: each is a Python object until it is parsed
-COMMENTS = ("#", "%", "//", ";", "!")
+# How a line begins that is for people. BASIC's REM and ' stand for themselves, 'x','y' is two cells between quotes; --
+# and * alone stand for a missing number.
+COMMENT = re.compile(r"""\s*([#%;!]|//|/\*|rem\b|(--|\*)\s*[a-z]|'(?![^']*'\s*([,;|\t ]|$)))""", re.IGNORECASE)
+AMONG_POINTS = re.compile(
+    r"\s*([#%;!]|//|comment\b|obj_info\b)", re.IGNORECASE
+)  # a comment among a PLY's or PCD's points
 # What programs write where there is no number
 MISSING = {"", "nan", "+nan", "-nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "?", "nan(ind)", "-nan(ind)",
            "1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind", "#num!", "*"}  # fmt: skip
@@ -89,8 +94,9 @@ def encoding_of(head: bytes) -> str:
 class Lines:
     """The lines of a text file that are not blank, and the number of the last one handed out."""
 
-    def __init__(self, file: TextIO, number: int = 0) -> None:
-        self.number, self.last = number, ""
+    def __init__(self, file: TextIO, number: int = 0, skip: re.Pattern[str] | None = None) -> None:
+        """number: of lines before. skip: matches the beginning of lines that are passed over."""
+        self.number, self.last, self.skip = number, "", skip
         self.lines = self.read(file)
 
     @staticmethod
@@ -110,17 +116,15 @@ class Lines:
     def __next__(self) -> str:
         for line in self.lines:
             self.number += 1
-            if line and not line.isspace() and line != END_OF_FILE:
+            if line and not line.isspace() and line != END_OF_FILE and not (self.skip and self.skip.match(line)):
                 self.last = line
                 return line
         raise StopIteration
 
-    def take(self, count: int, skip: tuple[str, ...] = ()) -> Rows:
-        """At most ``count`` lines, without those that begin with one of ``skip``."""
+    def take(self, count: int) -> Rows:
+        """At most ``count`` lines."""
         rows = Rows()
         for line in self:
-            if skip and line.lstrip().startswith(skip):
-                continue
             rows.lines.append(line)
             rows.numbers.append(self.number)
             if len(rows.lines) >= count:

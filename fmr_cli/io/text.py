@@ -25,7 +25,7 @@ from fmr_cli.io.fields import (
     unique,
 )
 from fmr_cli.io.stream import COLORS, CloudStream, Wanted
-from fmr_cli.io.table import COMMENTS, MOST_COLUMNS, ROWS, THOUSANDS, Dialect, Lines, Rows, number_in, open_text, parse
+from fmr_cli.io.table import COMMENT, MOST_COLUMNS, ROWS, THOUSANDS, Dialect, Lines, Rows, number_in, open_text, parse
 
 HEAD = 200  # lines that are looked at to tell how the file is written
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
@@ -34,6 +34,8 @@ PREAMBLE = 30  # lines before the names, at most
 FLAT = 100  # times as high as wide: a pole, or longitude and latitude with a height in metres
 DEGREES = "its x and y may be longitude and latitude, and degrees are no lengths: if so, project it first, to UTM say"
 BRACKETED = re.compile(r"\s*[\[({]\s*([\[({\"]|[+-]?[.\d])")  # JSON, Python, WKT: a list of points and no table
+SEXAGESIMAL = re.compile(r"[+-]?\d{1,3}[:\u00b0]\d{1,2}([:'\u2032].*)?")  # degrees, minutes and seconds
+MARKS = re.compile(r"\s*(rem\b|[#%/;!'*-]+)", re.IGNORECASE)  # that begin a comment
 SEQUENCE = 20  # rows numbered 1, 2, 3 ... that make a first column the points' numbers
 
 
@@ -57,7 +59,8 @@ def read(path: Path, wanted: Wanted) -> Iterator[PointCloud]:
         dtype = np.dtype([(name, np.float64) for name in names])
         bare: list[str] | None = None
         done, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
-        rest = iter(lambda: lines.take(ROWS, COMMENTS), None)
+        lines.skip = COMMENT  # in the head they may name the columns
+        rest = iter(lambda: lines.take(ROWS), None)
         for rows in chain([head], rest):
             last = not rows.lines
             if table.promised is not None:
@@ -110,10 +113,10 @@ def find_table(head: Rows) -> Table:
     other things than x y z, or of degrees, and where a line has fewer than three columns.
     """
     comments: list[str] = []
-    while head.lines and head.lines[0].lstrip().startswith(COMMENTS):
-        comments.append(head.lines.pop(0).strip().lstrip("#%/;!").strip())
+    while head.lines and COMMENT.match(head.lines[0]):
+        comments.append(re.sub(MARKS, "", head.lines.pop(0)).strip())
         head.numbers.pop(0)
-    for i in reversed([i for i, line in enumerate(head.lines) if line.lstrip().startswith(COMMENTS)]):
+    for i in reversed([i for i, line in enumerate(head.lines) if COMMENT.match(line)]):
         del head.lines[i], head.numbers[i]
     if head.lines and BRACKETED.match(head.lines[0]):
         raise CloudFileError(
@@ -125,12 +128,14 @@ def find_table(head: Rows) -> Table:
         head.numbers.pop(0)
     named: list[str] = []
     skip_preamble(head)
+    if head.lines and sum(1 for word in head.lines[0].replace(",", " ").split() if SEXAGESIMAL.fullmatch(word)) > 1:
+        refuse_degrees(("lon", "lat"))
     if head.lines and not any(map(is_number, first := names_in(head.lines[0]))):
         refuse_degrees(first)
         if not coordinates(first):
             raise CloudFileError(
-                f"line {head.numbers[0]}: expected numbers, or names of which some are x, y and z "
-                f"(or Easting, Northing, Elevation and the like), found {head.lines[0].strip()[:60]!r}"
+                f"line {head.numbers[0]}: expected numbers between blanks, tabs or one of , ; : |, or names of which "
+                f"some are x, y and z (Easting, Northing, Elevation and the like), found {head.lines[0].strip()[:60]!r}"
             )
         named = first
         del head.lines[0], head.numbers[0]
@@ -197,7 +202,7 @@ def use_numbers(head: Rows, dialect: Dialect, named: list[str], promised: int | 
 def find_dialect(head: Rows) -> Dialect:
     """What separates the cells, told by the first lines, whether commas are decimal, and how many columns there are."""
     lines = head.lines
-    delimiter = next((d for d in ";|" if d in lines[0]), None)
+    delimiter = next((d for d in ";|" if d in lines[0]), ":" if colons_part(lines[0]) else None)
     if delimiter is None and len({line.rstrip("\n").count("\t") for line in lines}) == 1 and "\t" in lines[0]:
         delimiter = "\t" if not any(map(blanks_part, lines[0].split("\t"))) else None
     quoted = any('"' in line for line in lines)
@@ -229,6 +234,12 @@ def find_dialect(head: Rows) -> Dialect:
     return dialect
 
 
+def colons_part(line: str) -> bool:
+    """Whether what stands between colons are numbers, or the names of coordinates."""
+    cells = line.split(":")
+    return len(cells) > 2 and (all(map(is_number, cells)) or coordinates(cells) is not None)
+
+
 def blanks_part(cell: str) -> bool:
     """Whether a cell between tabs holds several numbers between blanks."""
     return len(cell.split()) > 1 and all(map(is_number, cell.split())) and not THOUSANDS.fullmatch(cell.strip())
@@ -248,7 +259,7 @@ def decimals_between_commas(lines: list[str]) -> bool:
 
 def names_in(line: str) -> list[str]:
     """The words of a line that may name columns; their units stay, but where blanks separate."""
-    delimiter = next((d for d in ";\t|," if d in line), None)
+    delimiter = next((d for d in ";\t|," if d in line), ":" if colons_part(line) else None)
     if delimiter is None:
         line = re.sub(r"\s*[\[(][^\])]*[\])]", "", line)
         return line.strip().lstrip("#%/;!").split()

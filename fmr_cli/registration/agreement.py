@@ -37,10 +37,12 @@ class Agreement:
     """What two surfaces say of a pose, both ways taken together.
 
     explained, contradicted: points, of both. overlap: share of the smaller scan within TOUCHING of the other one.
-    explained_share: the same, of points that are explained. inlier_rmse: of touching points, own unit.
-    offset: how far these lie off each other's tangent planes, root mean square, over how far a surface's own
-        neighbours do. turn: the mean of 1 - |cosine| between their normals, over the same. Both are about 1 or less
-        where the scans are samples of one surface, whatever its curvature and noise.
+    explained_share: the same, of points that are explained.
+    inlier_rmse: how far touching points lie off each other's tangent planes, root mean square, own unit. It hardly
+        grows with the voxel edge, as the distance to the next point would.
+    offset: the same over how far a surface's own neighbours do. turn: the mean of 1 - |cosine| between their normals,
+        over the same. Both are about 1 or less where the scans are samples of one surface, whatever its curvature and
+        noise.
     detail: points, of both, that are explained and lie on none of the three planes of their largest corner: what a
         mere corner, which fits any other, lacks.
     stretch: by how much the source would have to grow or shrink to fit better, as a share, beyond what chance explains.
@@ -59,7 +61,7 @@ class Agreement:
 
 def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> Agreement:
     """Compare two surfaces on the same voxel edge at a pose between their frames."""
-    shares, explained_shares, sums, detail = [], [], np.zeros(8), 0.0
+    shares, explained_shares, sums, detail = [], [], np.zeros(7), 0.0
     for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
         moved = transform_points(T, a.points)
         distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
@@ -78,20 +80,20 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
         across = touching & (cosine < ACROSS) & (np.maximum(own_turn, a.unevenness[1][here]) < 1 - FACING)
         contradicted = over & (b.lean[there] < AT_BORDER) & (clear | across)
         sums += [
-            explained.sum(), contradicted.sum(), touching.sum(), (d[touching] ** 2).sum(), (off[touching] ** 2).sum(),
+            explained.sum(), contradicted.sum(), touching.sum(), (off[touching] ** 2).sum(),
             (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
         ]  # fmt: skip
         common, rng = here[explained], np.random.default_rng(0)
         detail += len(common) * share_beyond_corner(moved[common], n[explained], b.edge, rng)
         shares.append(touching.sum() / max(a.solid.sum(), 1))
         explained_shares.append(explained.sum() / max(a.solid.sum(), 1))
-    square, off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
+    off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
     return Agreement(
         explained=int(sums[0]),
         contradicted=int(sums[1]),
         overlap=float(max(shares)),
         explained_share=float(max(explained_shares)),
-        inlier_rmse=float(np.sqrt(square)) * target.edge if sums[2] else float("inf"),
+        inlier_rmse=float(np.sqrt(off2)) * target.edge if sums[2] else float("inf"),
         offset=float(np.sqrt((off2 + FLOOR**2) / (own_off2 + FLOOR**2))),
         turn=float((max(turns, 0) + FLOOR) / (own_turns + FLOOR)),
         detail=round(detail),

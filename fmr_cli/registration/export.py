@@ -24,7 +24,7 @@ def aligned_cloud(source: PointCloud | CloudStream, target: PointCloud | CloudSt
 
     Of a target of more than twice INDEXED points, the nearest of those that an even thinning keeps.
     """
-    index = collect((PointCloud(c.points, crs=c.crs) for c in stream_of(target)), INDEXED)
+    index = collect((PointCloud(c.points, crs=c.crs) for c in stream_of(target).bare()), INDEXED)
     distance = NearestDistance(index.points)
     moved = stream_of(source).transformed(T).map(lambda c: replace(c, crs=index.crs or c.crs))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fmr_cli.cloud import PointCloud, transform_points
-from fmr_cli.registration.confidence import ALIGNED, Candidate, among
+from fmr_cli.registration.confidence import Candidate, among
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration
 
@@ -17,9 +17,11 @@ HINT = (
     "axis is swapped or points the other way; mend it, or let --allow-mirror find a transform that mirrors"
 )
 BETTER = "the mirror image of the source fits better: {:.0%} of the smaller scan lies on the other one, not {:.0%}"
-# From so much of what both scans saw there that contradicts a pose, if it explains less than half of the smaller scan,
-# the mirror image is asked: a mirrored room fits where a wall and a corner do, by 17 to 30 %, 2 to 12 % against.
+# A pose that explains less than half of the smaller scan may be that of a mirrored room, which fits where a wall and a
+# corner do, by 17 to 40 %: the mirror image is asked. Mostly 2 to 12 % contradict it there; where hardly anything
+# does, a quick look has to be enough, since most of such poses are right.
 HARDLY, HALF = 0.01, 0.5
+EITHER = 0.5  # the most that is left of a pose where the mirror image, sure by itself, explains more of the scans
 
 
 def image(cloud: PointCloud | Prepared, seed: int) -> Prepared:
@@ -32,20 +34,24 @@ def image(cloud: PointCloud | Prepared, seed: int) -> Prepared:
 
 
 def unlikely(found: Registration) -> bool:
-    """Whether so little contradicts a pose, or it explains so much, that its mirror image need not be asked."""
+    """Whether a pose explains so much that its mirror image need not be asked."""
+    return bool(found.evidence["explained_share"] > HALF)
+
+
+def contradicted(found: Registration) -> bool:
+    """Whether more than hardly anything contradicts a pose."""
     against, explained = found.evidence["contradicted"], found.evidence["explained"]
-    return bool(against <= HARDLY * (explained + against) or found.evidence["explained_share"] > HALF)
+    return bool(against > HARDLY * (explained + against))
 
 
 def weighed(found: Registration, image: Candidate | None) -> Registration:
-    """What is left of a pose beside the mirror image's, if there is one: where that explains more, it has its share."""
+    """What is left of a pose beside the mirror image's, if there is one: where that explains more, no verdict."""
     share, other = found.evidence["explained_share"], image.evidence.explained_share if image else 0.0
     if image is None or other <= share:
         return found
-    confidence = among(found.confidence, [image.confidence])
-    aligned = confidence >= ALIGNED
-    reasons = found.reasons if aligned else [BETTER.format(other, share), *found.reasons]
-    return replace(found, confidence=confidence, status="aligned" if aligned else "uncertain", reasons=reasons)
+    confidence = min(among(found.confidence, [image.confidence]), EITHER)
+    reasons = [BETTER.format(other, share), *found.reasons]
+    return replace(found, confidence=confidence, status="uncertain", reasons=reasons)
 
 
 def undone(found: Registration, centre: np.ndarray) -> Registration:

@@ -52,7 +52,8 @@ def align(
     already. The answer is the same bit for bit, whatever their number and the machine's. check: also let the paper's IC
     solver go on from the pose found, see ``Registration.feature_check``. hints: where the pair is not ``aligned``, also
     take a quick look whether the source's mirror image fits, and warn; False where many pairs are tried that need not
-    fit. Where the scans contradict a pose somewhat, that look is part of the verdict: the better fit is believed.
+    fit. Where a pose explains less than half of the smaller scan, that look is part of the verdict: the better fit is
+    believed.
     Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or the device, FmrError
     for options that contradict each other.
     """
@@ -62,7 +63,7 @@ def align(
         return found
     fits = None
     if aligned or (hints and not options.allow_mirror):
-        fits = mirror_look(source, target, options, thorough=aligned)
+        fits = mirror_look(source, target, options, thorough=aligned and mirror.contradicted(found))
     if aligned:
         found = mirror.weighed(found, fits)
     if found.status == "aligned":

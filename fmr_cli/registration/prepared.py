@@ -44,7 +44,9 @@ class Prepared:
         points = points[found.keep]
         self.notes = [f"{cloud.name}: {note}" for note in cloud.notes]
         self.notes += [
-            f"{cloud.name}: {n} points {why} are no surface, set aside" for why, n in found.reasons.items() if n
+            f"{cloud.name}: {n} {f'points {why} are' if n > 1 else f'point {why} is'} no surface, set aside"
+            for why, n in found.reasons.items()
+            if n
         ]
         self.frame = Frame(points.mean(0) if len(points) else np.zeros(3))
         points = distinct(self.frame.enter(points))

@@ -32,7 +32,7 @@ class Registration:
     status: "aligned", or "uncertain" where the evidence at the pose speaks against it.
     confidence: the probability, from 0 to 1, that the pose is right; poses that fit as well share it.
     overlap: share of the smaller cloud's points that have a counterpart in the other one.
-    inlier_rmse: root mean square distance of those counterparts, own unit.
+    inlier_rmse: root mean square distance of those to the surface of their counterparts, own unit.
     feature_error_before, feature_error_after: mean |F(g Q) - F(P)| of the global feature as the files are, and at T.
     feature_errors: the same before each iteration of the IC solver that led to T, and after its last; empty where T
         came from local features.

@@ -20,7 +20,7 @@ from fmr_cli.report.page import write_page
 LINKS = (
     column("picture", "Picture", "picture"), column("status", "Status", "status"), column("source", "Source", "name"),
     column("target", "Target", "name"), column("confidence", "Confidence"), column("overlap", "Overlap", "share"),
-    column("inlier_rmse", "Point error (RMSE)"), column("seconds", "Seconds"), column("message", "Message", "words"),
+    column("inlier_rmse", "Surface error (RMSE)"), column("seconds", "Seconds"), column("message", "Message", "words"),
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from fmr_cli.evaluation.benchmark import Outcome, Summary
 from fmr_cli.evaluation.datasets.pair import DataSet
@@ -29,17 +29,23 @@ def number(value: float | None, form: str) -> str:
 
 
 def table(dataset: DataSet, measured: Sequence[Summary], quoted: Sequence[Quoted]) -> Table:
-    """What was measured here, a line, and what others published, with where it stands."""
-    shown = Table("method", "recall %", "RRE deg", "RTE", "aligned: right", "share", "s a pair", "from")
+    """What was measured here, a line, and what others published; below it where that stands, by its number."""
+    sources = list(dict.fromkeys(other.source for other in quoted))
+    shown = Table(
+        Column("method", min_width=14), "recall\n%", "RRE\ndeg", "RTE", "aligned:\nright", "share", "s a\npair",
+        Column("from", min_width=6),
+    )  # fmt: skip
     shown.title = f"{dataset.name}: {len(dataset.pairs)} pairs; right: {dataset.right.text}"
     for row in measured:
         verdict = [number(100 * x, ".1f") for x in (row.precision, row.share)]
         shown.add_row(row.method, number(100 * row.recall, ".1f"), number(row.rre, ".3f"), number(row.rte, ".4f"),
-                      *verdict, number(row.seconds, ".3f"), "measured")  # fmt: skip
+                      *verdict, number(row.seconds, ".3f"), "here")  # fmt: skip
     shown.add_section()
     for other in quoted:
         shown.add_row(other.method, number(other.recall, ".1f"), number(other.rre, ".3f"), number(other.rte, ".4f"),
-                      "", "", "", f"quoted: {other.source}", style="dim")  # fmt: skip
+                      "", "", "", f"({1 + sources.index(other.source)})", style="dim")  # fmt: skip
+    shown.caption = "\n".join(f"({number}) quoted: {source}" for number, source in enumerate(sources, 1))
+    shown.caption_justify = "left"
     return shown
 
 

@@ -27,7 +27,7 @@ SCANS = (
 LINKS = (
     column("picture", "Picture", "picture"), column("status", "Status", "status"), column("source", "Source", "name"),
     column("target", "Target", "name"), column("confidence", "Confidence"), column("overlap", "Overlap", "share"),
-    column("inlier_rmse", "Point error (RMSE)"),
+    column("inlier_rmse", "Surface error (RMSE)"),
     column("residual_rot_deg", "Off the network, °", hint="rotation between the link and the network's poses"),
     column("residual_shift", "Off the network, shift", hint="shift between the link and the network's poses"),
     column("strength", "Strength x y z", "short", "how firmly a shift along each axis is held, of the strongest"),

@@ -39,7 +39,7 @@ EVIDENCE = {
     "contradicted": ("points that contradict", "float off a surface that the other scan saw there"),
     "overlap": ("overlap", "share of the smaller scan near the other one"),
     "explained_share": ("overlap that is explained", "the same, counting explained points only"),
-    "inlier_rmse": ("RMSE", "of points near the other scan"),
+    "inlier_rmse": ("RMSE", "to the surface of the other scan"),
     "offset": ("offset", "distance between the surfaces over their own roughness; about 1 is as good as can be"),
     "turn": ("turn", "angle between the surfaces over their own unevenness; about 1 is as good as can be"),
     "detail": ("detail", "points explained that lie on none of the three planes of the largest corner"),

@@ -7,18 +7,23 @@ task (a file that is not there) is left out. Every wait has an end.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import platform
+import re
 import signal
 import socket
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 import uuid
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from http import HTTPStatus
 from typing import Any
 
 import fmr_cli
@@ -96,18 +101,25 @@ class DaskWorkers:
         else:
             check_address(self.address)
             try:
+                asyncio.run(shake_hands(self.address))
                 self.client = distributed.Client(self.address, timeout=CONNECT, set_as_default=False)
-            except (OSError, ValueError, RuntimeError) as error:
+            except Exception as error:  # what does not speak Dask's language is taken for a length of any size
+                why = "it speaks another language" if isinstance(error, MemoryError) else reason(error)
+                why = re.sub("^in <.*?>: ", "", why)[:120]  # a comm
                 raise FmrError(
-                    f"--dask {self.address}: no Dask scheduler answers there ({reason(error)[:80]}); "
-                    "give another address, or tls:// where it wants TLS"
+                    f"--dask {self.address}: no Dask scheduler answers there ({why}); check the port, which is not "
+                    "the dashboard's, and whether it wants tls:// and certificates that it knows"
                 ) from None
         try:
-            if self.client.dashboard_link:
+            if has_page(self.client.dashboard_link):
                 self.say(f"dashboard: {self.client.dashboard_link}")
-            self.had_workers = time.monotonic()
+            self.had_workers = begin = time.monotonic()
+            waits = False
             while not self.fit:
                 self.look_at_workers()
+                if not waits and time.monotonic() - begin > LOOK and not (self.fit or self.asked):
+                    waits = True
+                    self.say(f"waiting for workers, {NO_WORKERS:.0f} s at most")
                 time.sleep(0.02)
         except BaseException:
             self.__exit__()
@@ -291,7 +303,6 @@ def quiet(distributed: Any) -> None:
 
 def check_address(address: str) -> None:
     """Raises FmrError for what is no address, one where nobody listens, or TLS without certificates."""
-    from distributed import Security
     from distributed.comm import get_address_host_port
 
     scheme = address.split("://")[0]
@@ -301,11 +312,8 @@ def check_address(address: str) -> None:
         host, port = get_address_host_port(address)
     except ValueError as error:
         raise FmrError(f"--dask {address}: {reason(error)}; give an address such as tcp://host:8786") from None
-    if scheme == "tls" and not Security().get_connection_args("client").get("ssl_context"):
-        raise FmrError(
-            f"--dask {address}: no certificates for TLS; name them in Dask's configuration, distributed.comm.tls: "
-            "ca-file, client.cert, client.key"
-        )
+    if scheme == "tls":
+        check_certificates(address)
     try:
         socket.create_connection((host, port), CONNECT).close()
     except OSError as error:
@@ -314,5 +322,51 @@ def check_address(address: str) -> None:
         ) from None
 
 
+def check_certificates(address: str) -> None:
+    """Raises FmrError where Dask's configuration names none for a client, or some that cannot be read."""
+    from distributed import Security
+
+    remedy = "see distributed.comm.tls in Dask's configuration: ca-file, client.cert, client.key"
+    files = [file for file in Security().get_tls_config_for_role("client").values() if file and "\n" not in file]
+    for file in files:  # what ssl says names none
+        try:
+            open(file, "rb").close()
+        except OSError as error:
+            raise FmrError(f"--dask {address}: {file}: cannot be read ({reason(error)}); {remedy}") from None
+    try:
+        there = Security().get_connection_args("client").get("ssl_context")
+    except OSError as error:  # such as ssl.SSLError
+        raise FmrError(f"--dask {address}: no certificates in {', '.join(files)} ({reason(error)}); {remedy}") from None
+    if not there:
+        raise FmrError(f"--dask {address}: no certificates for TLS; {remedy}")
+
+
+def has_page(link: str) -> bool:
+    """Whether there may be something at an address: False where its server says that there is not, as without bokeh."""
+    try:
+        urllib.request.urlopen(urllib.request.Request(link, method="HEAD"), timeout=2).close()
+    except urllib.error.HTTPError as error:
+        return error.code != HTTPStatus.NOT_FOUND
+    except (OSError, ValueError):
+        return bool(link)  # maybe through a tunnel
+    return True
+
+
+async def shake_hands(address: str) -> None:
+    """Raises whatever Dask does where something else than a scheduler answers, such as its own dashboard.
+
+    A ``Client`` itself would wait without end for an answer, and for twenty seconds more when it fails.
+    """
+    from distributed import Security
+    from distributed.comm import connect
+
+    try:
+        async with asyncio.timeout(CONNECT):
+            comm = await connect(address, timeout=CONNECT, **Security().get_connection_args("client"))
+    except TimeoutError:
+        raise OSError(f"nothing for {CONNECT:.0f} s") from None
+    comm.abort()
+
+
 def reason(error: BaseException) -> str:
-    return " ".join(str(getattr(error, "strerror", None) or error or type(error).__name__).split())[:200]
+    return " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())[:200]

@@ -6,6 +6,7 @@ import importlib.util
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -94,6 +95,12 @@ def test_commands_and_options_that_are_spoken_of_are_there(page: Path) -> None:
         known = {flag for p in commands[name].params for flag in (*p.opts, *p.secondary_opts)} | everywhere
         for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]+", rest):
             assert flag in known, f"{page}: fmr {name} has no {flag}"
+
+
+def test_every_extra_is_on_the_page_of_installation() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    page = (ROOT / "docs" / "install.md").read_text("utf-8")
+    assert [extra for extra in extras if f"'.[{extra}]'" not in page] == []
 
 
 @pytest.mark.parametrize("page", [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "ARCHITECTURE.md")])

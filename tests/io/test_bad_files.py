@@ -64,7 +64,7 @@ BAD = {
     "negative.pcd": (pcd(-1, "binary") + bytes(1200), "damaged PCD header"),
     "no-data.pcd": (pcd(9, "binary").replace(b"DATA", b"DTA"), "no complete PCD header"),
     "unknown.pcd": (pcd(9, "zipped") + bytes(1200), "unknown PCD encoding"),
-    "odd.bin": (bytes(1601), "holds 1601 bytes, which is no number of points of 3 to 8 float32"),
+    "odd.bin": (bytes(1601), "holds 1601 bytes, which is no number of points of 3 to 10 float32"),
     "nan.bin": (np.full(40, np.nan, "<f4").tobytes(), "none of its 10 points has finite coordinates"),
     "words.xyz": (b"1 2 3\n\n4 5 6\n7 eight 9\n", "line 4: expected 3 numbers, found '7 eight 9'"),
     "ragged.csv": (b"x,y,z\n1,2,3\n1,2\n", "line 3: expected 3 numbers, found '1,2'"),

@@ -12,7 +12,7 @@ import pytest
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import CloudFileError
-from fmr_cli.io import WRITABLE, open_cloud, read_cloud, write_cloud
+from fmr_cli.io import WRITABLE, open_cloud, read_cloud, scans_of, write_cloud
 from fmr_cli.vectors import turn_vectors
 
 POINTS = [[1, 2.5, 3], [-4, 5, 600]]
@@ -59,11 +59,13 @@ def scan(columns: int, count: int, seed: int = 0) -> np.ndarray:
         3: [], 4: [rng.random(count)], 5: [rng.integers(0, 256, count), ring],
         6: list(rng.integers(0, 256, (3, count))), 7: [rng.random(count), *rng.integers(0, 256, (3, count))],
         8: [rng.random(count) * 90, ring, rng.random(count), rng.integers(300, 3000, count), angle],
+        9: [*np.tile([[0.0], [0.6], [0.8]], count), *rng.integers(0, 256, (3, count))],
+        10: [rng.random(count), *np.tile([[0.0], [0.6], [0.8]], count), *rng.integers(0, 256, (3, count))],
     }[columns]  # fmt: skip
     return np.column_stack([xyz, *extra]).astype("<f4")
 
 
-@pytest.mark.parametrize("columns", range(3, 9))
+@pytest.mark.parametrize("columns", range(3, 11))
 @pytest.mark.parametrize("count", [840, 16_800, 100_000])
 def test_the_layout_of_a_bin_is_told_by_its_values(tmp_path: Path, columns: int, count: int) -> None:
     """Counts for which many widths divide the size."""
@@ -72,7 +74,8 @@ def test_the_layout_of_a_bin_is_told_by_its_values(tmp_path: Path, columns: int,
     cloud = read_cloud(tmp_path / "a.bin")
     np.testing.assert_array_equal(cloud.points, rows[:, :3])
     names = {3: [], 4: ["intensity"], 5: ["intensity", "ring"], 6: ["red", "green", "blue"],
-             7: ["intensity", "red", "green", "blue"]}  # fmt: skip
+             7: ["intensity", "red", "green", "blue"], 9: ["nx", "ny", "nz", "red", "green", "blue"],
+             10: ["intensity", "nx", "ny", "nz", "red", "green", "blue"]}  # fmt: skip
     if columns in names:
         assert list(cloud.attributes) == names[columns]
     assert (cloud.layout is None) == (columns == 4)
@@ -295,6 +298,68 @@ def test_an_old_laszip_is_named_as_the_cause(tmp_path: Path) -> None:
     (tmp_path / "a.laz").write_bytes(data)
     with pytest.raises(CloudFileError, match="compressed by a LASzip of before 2011"):
         read_cloud(tmp_path / "a.laz")
+
+
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_comments_among_the_points_are_passed_over(tmp_path: Path, kind: str) -> None:
+    cloud = PointCloud(np.arange(30.0).reshape(10, 3))
+    path = tmp_path / f"a.{kind}"
+    head = {
+        "ply": "ply\nformat ascii 1.0\nelement vertex 10\n" + "".join(f"property float {c}\n" for c in "xyz")
+        + "end_header\n",
+        "pcd": "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 10\nHEIGHT 1\nPOINTS 10\n"
+        "DATA ascii\n",
+    }[kind]  # fmt: skip
+    rows = [" ".join(map(str, row)) for row in cloud.points.tolist()]
+    rows[7:7] = ["comment in between", "obj_info a"] if kind == "ply" else []
+    path.write_text(head + "\n".join(["# first", *rows[:3], "// third", "  # blank", *rows[3:], "# last"]) + "\n")
+    found = read_cloud(path)
+    np.testing.assert_array_equal(found.points, cloud.points)
+    assert found.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("magic", "suffix", "message"),
+    [
+        (b"ply\nformat ascii 1.0\n", ".pcd", "is a PLY by its first bytes: give it the suffix .ply"),
+        (b"LASF\0\0", ".xyz", "is a LAS or LAZ by its first bytes: give it the suffix .las"),
+        (b"PK\x03\x04rest", ".las", "is a ZIP archive by its first bytes: unpack it first"),
+        (b"\x1f\x8b\x08rest", ".ply", "is packed by gzip by its first bytes: unpack it first"),
+        (b"\x93NUMPY\x01", ".bin", "is a NPY by its first bytes: give it the suffix .npy"),
+        (b"version https://git-lfs.github.com/spec/v1\n", ".laz", "is a pointer of Git LFS and not the file itself"),
+        (b"\r\n<html><body>sign in", ".e57", "is a web page"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_for_what_it_is(
+    tmp_path: Path, magic: bytes, suffix: str, message: str
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(magic + bytes(200))
+    for reading in (read_cloud, scans_of) if suffix == ".e57" else (read_cloud,):
+        with pytest.raises(CloudFileError, match=re.escape(f"{path}: {message}")):
+            reading(path)
+
+
+def test_numbers_of_a_bin_that_are_whole(tmp_path: Path) -> None:
+    """A ring, a packed colour or a clock as uint32; records of 18 bytes, of which two make nine numbers."""
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(3000, 3)).astype("<f4") * [20, 20, 3]
+    color = rng.integers(0, 1 << 24, 3000)
+    for values, name in (
+        (rng.integers(0, 64, 3000), "ring"), (color, "color"), (color | 255 << 24, "color"),
+        (np.arange(3000) * 33, "time"),
+    ):  # fmt: skip
+        rows = np.zeros(3000, [("xyz", "<f4", 3), ("w", "<u4")])
+        rows["xyz"], rows["w"] = points, values
+        rows.tofile(tmp_path / "a.bin")
+        cloud = read_cloud(tmp_path / "a.bin")
+        assert list(cloud.attributes) == [name]
+        np.testing.assert_array_equal(cloud.attributes[name], values)
+        assert cloud.layout == f"16 bytes a point, by their values x y z {name}:u4"
+    rows = np.zeros(3000, [("xyz", "<f4", 3), ("i", "<f4"), ("ring", "<u2")])
+    rows["xyz"], rows["i"], rows["ring"] = points, rng.random(3000), rng.integers(0, 32, 3000)
+    rows.tofile(tmp_path / "a.bin")
+    assert list(read_cloud(tmp_path / "a.bin").attributes) == ["intensity", "ring"]
 
 
 @pytest.mark.parametrize("kind", ["ply", "pcd"])

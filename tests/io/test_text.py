@@ -58,6 +58,13 @@ DIALECTS = {
     "two-scans.pts": ("1\n1 2.5 3 7\n1\n-4 5 600 8\n", {"intensity": [7, 8]}),
     "rgb-normals.xyz": ("1 2.5 3 9 8 7 0 0 1\n-4 5 600 6 5 4 0.6 0 0.8\n",
                         {"red": [9, 6], "green": [8, 5], "blue": [7, 4], "nx": [0, 0.6], "ny": [0, 0], "nz": [1, 0.8]}),
+    "colons.txt": ("1:2.5:3\n-4:5:600\n", {}),
+    "colons-names.txt": ("X:Y:Z:i\n1:2.5:3:9\n-4:5:600:8\n", {"intensity": [9, 8]}),
+    "rem.txt": ("REM exported by a survey\nrem x y z\n1 2.5 3\nREM in between\n-4 5 600\n", {}),
+    "apostrophe.txt": ("' it's exported\n' x y z t\n1 2.5 3 7\n'in between\n-4 5 600 8\n", {"t": [7, 8]}),
+    "apostrophe-quotes.csv": ("'x','y','z'\n'1','2.5','3'\n'-4','5','600'\n", {}),
+    "dashes.txt": ("-- exported\n* by hand\n/* so */\n1 2.5 3\n-4 5 600\n", {}),
+    "dashes-for-none.txt": ("x y z q\n1 2.5 3 --\n-4 5 600 *\n", {"q": [np.nan, np.nan]}),
     "asc.asc": ("1 2.5 3\n-4 5 600\n", {}),
 }  # fmt: skip
 
@@ -114,9 +121,13 @@ def test_a_long_file_is_read_as_its_parts(tmp_path: Path) -> None:
     [
         ("lon,lat,alt\n9.1,48.7,300\n", "longitude and latitude, and degrees are no lengths: project it"),
         ("Latitude;Longitude;Height\n48.7;9.1;300\n", "longitude and latitude"),
+        ("48:12:05.5 9:10:44 300\n48:12:05.7 9:10:45 300\n", "degrees are no lengths"),
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 9\n", "is a pointer of Git LFS"),
+        ("<!DOCTYPE html>\n<html>404</html>\n", "is a web page"),
+        ("1/2/3\n", "expected numbers between blanks, tabs or one of , ; : |"),
         ("0 -1 0 9\n1 0 0 8\n0 0 1 7\n0 0 0 1\n", "holds a 4x4 transform and no points"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 5 0 1 0 0 0 0 1 0\n", "holds poses and no points"),
-        ("a,b,c\n1,2,3\n", "line 1: expected numbers, or names of which some are x, y and z"),
+        ("a,b,c\n1,2,3\n", "line 1: expected numbers between blanks, tabs or one of , ; : |, or names"),
         ("1;2;3\n1,234.5;2;3\n", "line 2: '1,234.5' has marks between the thousands"),
         ("1.234,5;2;3\n1;2;3\n", "marks between the thousands"),
         ("x;y;z\n1'234.5;2;3\n", "marks between the thousands"),

@@ -72,7 +72,7 @@ def test_any_start_and_part_overlap_by_default(found: Registration, room_scans: 
     assert found.status == "aligned"
     assert found.confidence > 0.9
     assert 0.4 < found.overlap < 0.9
-    assert found.inlier_rmse < found.voxel_size
+    assert found.inlier_rmse < found.voxel_size / 4  # to the surface; the next point is half a voxel off
     assert found.feature_error_after < found.feature_error_before
     assert found.angle == pytest.approx(np.degrees(Rotation.from_matrix(ANY[:3, :3]).magnitude()), abs=0.2)
 

@@ -50,6 +50,16 @@ def test_samples_of_one_surface_differ_as_neighbours_do_at_the_right_pose_alone(
     assert min(shifted.offset, turned.offset) > 1.3 * right.offset
 
 
+@pytest.mark.parametrize("edge", [0.05, 0.1])
+def test_the_rmse_is_that_to_the_surface_and_not_to_the_next_point(edge: float) -> None:
+    """Voxels of one surface lie about half an edge from each other, and a hundredth off it."""
+    rng = np.random.default_rng(0)
+    source, target = (Surface(ball(rng, 0.0), edge) for _ in range(2))
+    found = agreement(source, target, np.eye(4))
+    assert found.inlier_rmse < 0.1 * edge
+    assert agreement(source, target, pose(0, edge)).inlier_rmse > 3 * found.inlier_rmse
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_the_evidence_has_no_unit(unit: float) -> None:
     rng = np.random.default_rng(0)

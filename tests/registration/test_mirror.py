@@ -54,7 +54,12 @@ def test_where_the_mirror_image_fits_better_a_pose_is_not_believed(clouds: tuple
     assert not mirror.unlikely(part)
     doubted = mirror.weighed(part, image)
     assert doubted.status == "uncertain"
-    assert doubted.confidence < 0.7
+    assert doubted.confidence <= mirror.EITHER
+    assert mirror.contradicted(part)
+    smooth = replace(part, evidence=part.evidence | {"contradicted": 0})  # a corner and a wall of a mirrored room
+    assert not mirror.unlikely(smooth)
+    assert not mirror.contradicted(smooth)
+    assert mirror.weighed(smooth, image).status == "uncertain"
     assert "the mirror image of the source fits better" in doubted.reasons[0]
     assert mirror.weighed(replace(right, evidence=right.evidence | {"explained_share": 1.0}), image).status == "aligned"
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 import csv
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -17,9 +19,10 @@ import numpy as np
 import pytest
 
 distributed = pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
 
 from workers import work  # noqa: E402
-from workers.cluster import Cluster, stop, wait_for  # noqa: E402
+from workers.cluster import Cluster, certificates, stop, wait_for  # noqa: E402
 
 import fmr_cli  # noqa: E402
 from fmr_cli import read_cloud, write_cloud  # noqa: E402
@@ -216,7 +219,7 @@ def test_a_network_whose_workers_are_killed_and_stopped_gives_the_same_files(sha
 
 
 @pytest.mark.slow
-def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path, monkeypatch, capsys):
+def test_the_command_evaluates_the_same(shared, tmp_path, monkeypatch, capsys):
     found = []
     experiment = ["--no-align", "--experiments", "noise", "--pairs", "2", "--points", "64"]
     for more in (["--dask", shared.address], []):
@@ -226,7 +229,7 @@ def test_the_command_says_the_dashboard_and_evaluates_the_same(shared, tmp_path,
             main()
         said = capsys.readouterr().err
         assert end.value.code == 0, said
-        assert ("dashboard: http" in said) == bool(more)
+        assert "dashboard: http" not in said  # this scheduler has none
         with (out / "results.csv").open(newline="") as file:
             found.append([{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)])
     assert len(found[0]) == 10
@@ -247,8 +250,11 @@ def test_a_task_that_kills_its_workers_is_the_only_one_lost(shared):
 def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monkeypatch):
     with Cluster(tmp_path) as alone:
         monkeypatch.setattr(cluster, "NO_WORKERS", 0.5)
-        with pytest.raises(FmrError, match="it has no workers"), DaskWorkers(alone.address):
+        monkeypatch.setattr(cluster, "LOOK", 0.1)
+        said = []
+        with pytest.raises(FmrError, match="it has no workers"), DaskWorkers(alone.address, say=said.append):
             pass
+        assert said == ["waiting for workers, 0 s at most"]
         monkeypatch.setattr(cluster, "NO_WORKERS", 120)
         without = alone.worker(WITHOUT_FMR)
         with (
@@ -266,6 +272,77 @@ def test_no_workers_then_none_that_can_be_used_then_no_scheduler(tmp_path, monke
             with pytest.raises(FmrError, match="lost the connection"):
                 list(answers)
             assert time.monotonic() - begin < 10 * cluster.CONNECT
+
+
+@pytest.fixture
+def server():
+    """Listens on a port of this machine, and gives each that comes what it is told to; or nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        came, says = [], []
+
+        def serve():
+            while True:
+                try:
+                    came.append(listening.accept()[0])
+                except OSError:
+                    return
+                came[-1].recv(1024 if says else 1)
+                came[-1].sendall(b"".join(says))
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"127.0.0.1:{listening.getsockname()[1]}", says
+        listening.shutdown(socket.SHUT_RDWR)
+    for connection in came:
+        connection.close()
+
+
+@pytest.mark.parametrize(("says", "said"), [(b"", "nothing for 1 s"), (b"HTTP/1.1 400 No\r\n\r\n", "another language")])
+def test_what_answers_is_no_scheduler(server, monkeypatch, says, said):
+    """As the dashboard's port, a web server's, one behind a gate that lets nothing through."""
+    monkeypatch.setattr(cluster, "CONNECT", 1.0)
+    address, what = server
+    what.append(says)
+    with pytest.raises(FmrError, match=f"no Dask scheduler answers there.*{said}"):
+        DaskWorkers(address).__enter__()
+
+
+@pytest.mark.parametrize(("status", "there"), [(b"200 OK", True), (b"404 Not Found", False), (b"403 No", True)])
+def test_the_dashboard_is_said_where_there_may_be_one(server, status, there):
+    address, says = server
+    says.append(b"HTTP/1.1 " + status + b"\r\nConnection: close\r\n\r\n")
+    assert cluster.has_page(f"http://{address}/status") == there
+    assert cluster.has_page("http://127.0.0.1:9/status")  # maybe through a tunnel
+    assert not cluster.has_page("")
+
+
+@pytest.mark.slow
+def test_tls(tmp_path):
+    """A scheduler that wants certificates takes a client that shows one, and turns the others away."""
+    if not shutil.which("openssl"):
+        pytest.skip("openssl makes the certificates")
+    certificates(tmp_path)
+
+    def shown(name: str) -> dict[str, str]:
+        """Dask's settings for whoever shows this certificate."""
+        files = {"cert": tmp_path / f"{name}.pem", "key": tmp_path / f"{name}-key.pem"}
+        tls = {
+            f"{role}.{what}": str(file) for role in ("scheduler", "worker", "client") for what, file in files.items()
+        }
+        return {
+            f"distributed.comm.tls.{key}": value for key, value in ({"ca-file": str(tmp_path / "ca.pem")} | tls).items()
+        }
+
+    variables = {f"DASK_{key.upper().replace('.', '__').replace('-', '_')}": v for key, v in shown("node").items()}
+    with Cluster(tmp_path, "tls", DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION="True", **variables) as secured:
+        assert secured.address.startswith("tls://")
+        secured.worker()
+        with dask.config.set(shown("node")), DaskWorkers(secured.address, say=lambda _: None) as workers:
+            assert [*workers.run(work.square, range(3))] == [0, 1, 4]
+        for name, said in (("stranger", "no Dask scheduler answers there"), ("nobody", "nobody.pem: cannot be read")):
+            with dask.config.set(shown(name)), pytest.raises(FmrError, match=said):
+                DaskWorkers(secured.address).__enter__()
+        with pytest.raises(FmrError, match="no Dask scheduler answers there"):
+            DaskWorkers(secured.address.replace("tls", "tcp")).__enter__()
 
 
 @pytest.mark.parametrize(

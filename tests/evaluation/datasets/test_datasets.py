@@ -13,6 +13,7 @@ from fmr_cli.cloud import transform_points
 from fmr_cli.errors import FmrError
 from fmr_cli.evaluation.datasets import read_dataset, recognised
 from fmr_cli.evaluation.datasets.kitti import ten_metres
+from fmr_cli.evaluation.datasets.modelnet40 import SEEN, UNSEEN
 from fmr_cli.evaluation.datasets.pair import (
     CorrespondenceRmse,
     Loaded,
@@ -190,6 +191,20 @@ def test_modelnet40_in_four_groups(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.source, partial.source)
     other = read_dataset("modelnet40", [tmp_path], seed=1).pairs[2].load()
     assert not np.array_equal(other.T_target_source, partial.T_target_source)
+
+
+def test_modelnet40s_pairs_by_hand(tmp_path: Path) -> None:
+    """20 + 20 categories by their alphabet; 4.9 deg or 0.09 off is right, 5.1 or 0.11 is not."""
+    assert (len(SEEN), len(UNSEEN)) == (20, 20)
+    assert [*SEEN, *UNSEEN] == sorted({*SEEN, *UNSEEN})
+    layouts.write_modelnet(tmp_path)
+    found = read_dataset("modelnet40", [tmp_path])
+    for pair in (each.load() for each in found.pairs):
+        assert np.linalg.norm(pair.source, axis=1).max() <= 1 + 0.05 * np.sqrt(3)  # the unit sphere, and the noise
+        for degrees, shift in ((4.9, 0.0), (5.1, 0.0), (0.0, 0.09), (0.0, 0.11)):
+            T = shifted(turned(pair.T_target_source, degrees), (shift, 0, 0))
+            np.testing.assert_allclose(errors(T, pair), (degrees, shift), atol=1e-6)
+            assert found.right(T, pair) == (degrees < 5 and shift < 0.1)
 
 
 def test_7scenes_with_poses_and_without(tmp_path: Path) -> None:
