@@ -307,7 +307,7 @@ def find_module(path: Path, suffixes: tuple[str, ...]) -> tuple[ModuleType, str,
     if full not in suffixes:
         if path.is_dir():
             raise CloudFileError(f"{path}: is a folder, give a file in it")
-        if suffixes is SUFFIXES and not path.exists():
+        if suffixes is SUFFIXES and not path.exists() and not address_of(path):
             raise CloudFileError(f"{shown(path)}: no such file, check the name")
         what = f"the suffix {full!r} cannot be {'read' if suffixes is SUFFIXES else 'written'}"
         raise CloudFileError(f"{shown(path)}: {what if full else 'has no suffix'}, use one of {' '.join(suffixes)}")

@@ -235,9 +235,13 @@ def bridges_between(component: Component, links: list[Link], some: list[int], so
     came: dict[int, tuple[int, int]] = {source: (source, -1)}  # by a search in width: the scan before, and the link
     front = [source]
     while front and target not in came:
-        front = [
-            m for k in front for m, n in near[k] if m not in came and came.setdefault(m, (k, n))
-        ]  # fmt: skip
+        reached = []
+        for k in front:
+            for m, n in near[k]:
+                if m not in came:
+                    came[m] = k, n
+                    reached.append(m)
+        front = reached
     path = []
     at = target if target in came else source
     while at != source:
