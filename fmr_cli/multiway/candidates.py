@@ -167,6 +167,14 @@ def untried(survey: Survey, start: str, least: float = PROMISING) -> list[Ends]:
     return sorted((p for p in pairs if p not in survey.never), key=lambda p: (-survey.looks[p].promise, p))
 
 
+def alike_first(survey: Survey, pairs: Iterable[Ends]) -> list[Ends]:
+    """Pairs, those first whose scans most resemble each other as places: where looks have failed, that still tells."""
+    place = {n: k for k, n in enumerate(sorted(survey.edges))}
+    with survey.stage("look"):
+        alike = looks.similarity([survey.description(n) for n in place])
+    return sorted(pairs, key=lambda p: (-alike[place[p[0]], place[p[1]]], p))
+
+
 def leading_out(survey: Survey, pairs: Iterable[Ends], most: int) -> list[Ends]:
     """Of pairs, best first, the first ``most`` of each component that join it to another one."""
     home = {n: k for k, c in enumerate(survey.components) for n in c.T_component_scan}

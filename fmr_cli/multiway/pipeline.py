@@ -66,9 +66,13 @@ def align_many(
             if len(survey.components) > 1 and look_by_planes(survey, most):
                 join_components(survey)
                 confirm(survey)
-        if try_dear_starts(survey):
-            join_components(survey)
-            confirm(survey)
+        joined = True
+        while joined:  # as long as they lead anywhere
+            apart = len(survey.components)
+            if try_dear_starts(survey):
+                join_components(survey)
+                confirm(survey)
+            joined = len(survey.components) < apart
         return adjust(survey)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmr_cli.multiway.candidates import leading_out, untried
+from fmr_cli.multiway.candidates import alike_first, leading_out, untried
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.registering import Attempt, attempt, from_look, register_all
 from fmr_cli.multiway.survey import Ends, Survey, nearest_pairs
@@ -20,7 +20,8 @@ ROUNDS = 12  # of joining components, at most
 CONFIRMED = 3  # links of a scan that stop the search for more
 SHARED = 0.3  # overlap at the network's poses from which an untried pair is worth registering
 ROUND_TRIP = 4  # links between two scans that overlap, from which one between them is worth it whatever they have
-DEAR, DEAR_SHARE = 2, 0.5  # pairs of a component that the dear starts are tried on; of all scans, at most
+DEAR, DEAR_IN_ALL = 2, 12  # pairs of a component that the dear starts are tried on; of few components, more of each
+DEAR_SHARE = 0.5  # of all scans: so many pairs, at most
 
 
 def register_most_promising(survey: Survey) -> None:
@@ -101,10 +102,11 @@ def links_between(survey: Survey, members: list[int]) -> dict[tuple[int, int], i
 
 
 def try_dear_starts(survey: Survey) -> bool:
-    """For scans that are still apart, ``align`` as it is for a pair alone, on the few most promising pairs."""
+    """For scans that are still apart, ``align`` as it is for a pair alone, on the few pairs that most resemble."""
     if len(survey.components) == 1:
         return False
-    pairs = leading_out(survey, untried(survey, "auto", -np.inf), DEAR)
+    most = max(DEAR, DEAR_IN_ALL // len(survey.components))
+    pairs = leading_out(survey, alike_first(survey, untried(survey, "auto", -np.inf)), most)
     pairs = pairs[: max(2, int(DEAR_SHARE * len(survey.edges)))]
     register_all(survey, [attempt(survey, *pair, "auto") for pair in sorted(pairs)])
     return bool(pairs)
