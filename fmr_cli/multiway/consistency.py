@@ -32,7 +32,6 @@ from fmr_cli.multiway.looks import displacement
 from fmr_cli.multiway.visibility import Seen, total
 
 JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
-DOUBTFUL = 0.9  # the same where none is, but several agree: two rooms that resemble each other agree in a doubtful way
 DENIALS = (
     (0.5, 3.0),
     (0.3, 1.0),
@@ -68,10 +67,11 @@ class Join:
 
     @property
     def holds(self) -> bool:
-        """Whether scans are joined by it: a doubtful link never does so alone, nor do several that leave a doubt."""
-        if self.sound:
-            return self.probability >= JOINED
-        return len(self.links) > 1 and self.probability >= DOUBTFUL
+        """Whether scans are joined by it: doubtful links never do so alone, however many agree.
+
+        Where two places resemble each other, all links between them are wrong in the same way.
+        """
+        return self.sound and self.probability >= JOINED
 
 
 def joined(
