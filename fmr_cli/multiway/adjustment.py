@@ -214,6 +214,8 @@ def apart(survey: Survey) -> list[Apart]:
 def why_not(link: Link, join: Join) -> str:
     """What speaks against a join, for a person."""
     reasons = [f"confidence {link.confidence:.2f}"]
+    if len(join.links) > 1 and not join.sound:
+        reasons.append(f"none of {len(join.links)} links that agree is sure by itself")
     if join.against > 0.05:
         reasons.append(f"another pose fits about as well ({join.against:.2f})")
     if join.denied:
