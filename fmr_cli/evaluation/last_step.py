@@ -56,6 +56,7 @@ EXPERIMENTS = {
         Experiment("refine-sensors", "noise of the source", tuple((v, Degraded(v, 0.0)) for v in _NOISE), _WITH_LIMIT),
     )
 }  # fmt: skip
+TRIES = 100  # of a made-up scene: one in thirty determines no pose
 TWO_SENSORS = "refine-sensors"  # on made-up scenes by two sensors; on scans, noise of the source alone
 
 Step = Callable[[Pair, np.ndarray], np.ndarray]  # a pose between the centred frames, and a better one
@@ -140,7 +141,7 @@ def samples(clouds: Clouds | None, experiment: str, points: int, rng: np.random.
     """Two samples of a made-up scene, or of one of the clouds (whose normals are those of all its points)."""
     if clouds is None:
         make = near_pairs.two_sensors if experiment == TWO_SENSORS else near_pairs.made_up
-        return next(drawn for drawn in iter(lambda: make(rng, points), None) if drawn.determined)
+        return next(drawn for drawn in (make(rng, points) for _ in range(TRIES)) if drawn.determined)
     cloud = clouds.points[int(rng.integers(len(clouds.points)))].double().cpu().numpy()
     normals = normals_and_variation(cloud, *neighbours(cloud, cKDTree(cloud)))[0]
     return near_pairs.halves(cloud, normals, points, rng)

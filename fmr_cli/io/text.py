@@ -114,7 +114,7 @@ def find_table(head: Rows) -> Table:
     """
     comments: list[str] = []
     while head.lines and COMMENT.match(head.lines[0]):
-        comments.append(re.sub(MARKS, "", head.lines.pop(0)).strip())
+        comments.append(MARKS.sub("", head.lines.pop(0)).strip())
         head.numbers.pop(0)
     for i in reversed([i for i, line in enumerate(head.lines) if COMMENT.match(line)]):
         del head.lines[i], head.numbers[i]

@@ -113,8 +113,9 @@ def agreeing(survey: Survey, component: Component) -> list[Link]:
         elif link.status == "aligned" and not agreed:
             link.status = "rejected"
             what = "the poses of the fixed scans" if both_held else "other links"
-            off = contradiction(survey, link, between(poses, link)) * link.edge
-            link.message = said(link, f"contradicts {what}: {off:.3g} apart")
+            off = contradiction(survey, link, between(poses, link))
+            if off > claims.AGREE * claims.lenient(len(poses)):
+                link.message = said(link, f"contradicts {what}: {off * link.edge:.3g} apart")
     return used
 
 

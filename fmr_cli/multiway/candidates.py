@@ -33,8 +33,7 @@ def look_at_pairs(survey: Survey) -> None:
         look_at(survey, [(j, i) for n, i in enumerate(numbers) for j in numbers[n + 1 :] if survey.possible(j, i)])
     else:
         with survey.stage("look"):
-            alike = looks.similarity([survey.description(n) for n in numbers])
-            orders = (-alike).argsort(axis=1, kind="stable")
+            orders = (-survey.similarity).argsort(axis=1, kind="stable")
             survey.alike = {i: [numbers[k] for k in orders[row] if k != row] for row, i in enumerate(numbers)}
         look_further(survey)
 
@@ -170,9 +169,7 @@ def untried(survey: Survey, start: str, least: float = PROMISING) -> list[Ends]:
 def alike_first(survey: Survey, pairs: Iterable[Ends]) -> list[Ends]:
     """Pairs, those first whose scans most resemble each other as places: where looks have failed, that still tells."""
     place = {n: k for k, n in enumerate(sorted(survey.edges))}
-    with survey.stage("look"):
-        alike = looks.similarity([survey.description(n) for n in place])
-    return sorted(pairs, key=lambda p: (-alike[place[p[0]], place[p[1]]], p))
+    return sorted(pairs, key=lambda p: (-survey.similarity[place[p[0]], place[p[1]]], p))
 
 
 def leading_out(survey: Survey, pairs: Iterable[Ends], most: int) -> list[Ends]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from fmr_cli.multiway.claims import (
 )  # fmt: skip
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
+from fmr_cli.multiway.parts import parts
 from fmr_cli.multiway.visibility import Seen, total
 
 JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
@@ -164,13 +166,13 @@ def joined(
             del joins[key]
         exact = {k for k in exact if keep not in k and gone not in k}
         joins.update({key: found[0] for key in between if keep in key and (found := rivals(key, exact=False))})
-    parts: list[Component] = []
-    seen_through = {n for join in refused for n in join.links}
+    kept: list[Component] = []
+    forbidden_links = {n for join in refused for n in join.links}
     for component in components.values():
-        pieces, disputed = undisputed(component, links, moments, scans, seen_through)
-        parts += pieces
+        pieces, disputed = undisputed(component, links, moments, scans, forbidden_links)
+        kept += pieces
         refused += disputed
-    order = sorted(parts, key=lambda c: (-len(c.T_component_scan), min(c.T_component_scan)))
+    order = sorted(kept, key=lambda c: (-len(c.T_component_scan), min(c.T_component_scan)))
     place = {n: k for k, c in enumerate(order) for n in c.T_component_scan}
     left: dict[tuple[int, int], Join] = {}
     for join in [*joins.values(), *refused]:
@@ -182,14 +184,14 @@ def joined(
 
 
 def undisputed(
-    component: Component, links: list[Link], moments: dict[int, np.ndarray], scans: set[int], refused: set[int]
+    component: Component, links: list[Link], moments: dict[int, np.ndarray], scans: set[int], forbidden_links: set[int]
 ) -> tuple[list[Component], list[Join]]:
     """The parts of a component that don't hang on a link which is as likely wrong as one that contradicts it.
 
     A sure link that the poses contradict closes a cycle with those that they agree with, of which one at least is
     wrong. Where others bypass it, they tell which. Of those that nothing bypasses (bridges), and of the link itself,
     P(k is wrong) is in proportion to exp(-log odds of k). Also gives the joins that are taken off.
-    refused: links, by number, that deny nothing, since views forbid what they say.
+    scans: whose views tell. forbidden_links: by number; they deny nothing, since views forbid what they say.
     """
     poses = component.T_component_scan
     holding: dict[int, float] = {}  # links, by number: their log odds
@@ -201,7 +203,7 @@ def undisputed(
         agreed = agreeing(link, poses, moments[link.source], told)
         if agreed:
             holding[number] = max(log_odds(link.hypotheses[k], told) for k in agreed)
-        elif link.status == "aligned" and number not in refused and not contradicted(link.hypotheses[0], told):
+        elif link.status == "aligned" and number not in forbidden_links and not contradicted(link.hypotheses[0], told):
             against[number] = log_odds(link.hypotheses[0], told)
     if component.held:  # whatever its scans' links say, they are where they are
         holding = {n: x for n, x in holding.items() if not component.held.issuperset(links[n].ends)}
@@ -220,9 +222,9 @@ def undisputed(
     groups: dict[int, dict[int, np.ndarray]] = defaultdict(dict)
     for n, home in homes(component, ends).items():
         groups[home][n] = poses[n]
-    parts = [Component(group, component.held & group.keys()) for group in groups.values()]
+    pieces = [Component(group, component.held & group.keys()) for group in groups.values()]
     joins = [Join(np.eye(4), holding[n], right, 1 - right, (n,), 0, True) for n, right in sorted(cut.items())]
-    return parts, joins
+    return pieces, joins
 
 
 def bridges_between(component: Component, links: list[Link], some: list[int], source: int, target: int) -> list[int]:
@@ -253,12 +255,8 @@ def bridges_between(component: Component, links: list[Link], some: list[int], so
 
 def homes(component: Component, ends: Iterable[tuple[int, int]]) -> dict[int, int]:
     """The part of a component that each scan is in, if links join so many pairs; scans that don't move are in one."""
-    home = {n: min(component.held) if n in component.held else n for n in component.T_component_scan}
-    for i, j in ends:
-        a, b = home[i], home[j]
-        if a != b:
-            home = {n: a if h == b else h for n, h in home.items()}
-    return home
+    held = sorted(component.held)
+    return parts(component.T_component_scan, [*pairwise(held), *ends])
 
 
 def forbidden(seen: list[Seen]) -> bool:

@@ -66,13 +66,11 @@ def align_many(
             if len(survey.components) > 1 and look_by_planes(survey, most):
                 join_components(survey)
                 confirm(survey)
-        joined = True
-        while joined:  # as long as they lead anywhere
-            apart = len(survey.components)
-            if try_dear_starts(survey):
-                join_components(survey)
-                confirm(survey)
-            joined = len(survey.components) < apart
+        before = math.inf
+        while (apart := len(survey.components)) < before and try_dear_starts(survey):  # as long as they join any
+            before = apart
+            join_components(survey)
+            confirm(survey)
         return adjust(survey)
 
 

@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,11 @@ class Survey:
         if (number, edge) not in self.described:
             self.described[number, edge] = looks.describe(self.store.prepared(number), edge, self.local)
         return self.described[number, edge]
+
+    @cached_property
+    def similarity(self) -> np.ndarray:
+        """How alike usable scans look as places, in the order of their numbers: (n, n)."""
+        return looks.similarity([self.description(n) for n in sorted(self.edges)])
 
     def moment(self, number: int) -> np.ndarray:
         """(4, 4), see ``looks.Description``."""

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fmr_cli.multiway.parts import parts
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 
 FINER = 2.0  # times the grid on which pairs are registered
@@ -240,15 +241,13 @@ def from_one_place(found: Iterable[tuple[tuple[int, int], Seen]], bound: float =
     """
     least: dict[int, float] = {}
     hidden: dict[int, float] = {}
-    home: dict[int, int] = {}
+    pairs: list[tuple[int, int]] = []
     for (i, j), seen in found:
+        pairs.append((i, j))
         for n in (i, j):
             least[n] = min(least.get(n, np.inf), seen.contradiction)
             hidden[n] = min(hidden.get(n, np.inf), seen.hidden)
-            home.setdefault(n, n)
-        a, b = home[i], home[j]
-        if a != b:
-            home = {n: a if h == b else h for n, h in home.items()}
+    home = parts(least, pairs)
     groups = [[n for n in home if home[n] == g] for g in sorted(set(home.values()))]
     one_place = (
         g for g in groups if np.median([least[k] for k in g]) <= bound and np.median([hidden[k] for k in g]) <= HIDDEN

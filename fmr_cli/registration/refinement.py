@@ -118,13 +118,12 @@ def common_points(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, 
 
 def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     """The pose after GICP, or after point-to-plane within the options' motions and scale."""
+    s, t, edge = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge), pair.edge
     if pair.options.scale or pair.motion.dof != "rigid":
-        s, t = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge)
-        return constrained(s, t, T_target_source, pair.edge, pair.motion.basis(), pair.options.scale)
-    s, target = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.for_gicp(GICP_TARGET, pair.edge, pair.threads)
-    T = gicp_in_reach(pair, s, target, T_target_source)
-    t, edge, any_motion = pair.target.fine(GICP_TARGET, pair.edge), pair.edge, np.eye(6)
+        return constrained(s, t, T_target_source, edge, pair.motion.basis(), pair.options.scale)
+    T = gicp_in_reach(pair, s, pair.target.for_gicp(GICP_TARGET, edge, pair.threads), T_target_source)
     if noisy(pair):
+        any_motion = np.eye(6)
         clean_source, clean_target = (roughness < CLEAN for roughness, _ in roughnesses(pair))
         if clean_target:  # onto a clean scan's own planes, which smoothing would bend
             T = constrained(s, t, T, edge, any_motion, False)

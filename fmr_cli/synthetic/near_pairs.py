@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import transform_points
+from fmr_cli.geometry.point_to_plane import linearise
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.synthetic import scenes, sensors
 
@@ -44,11 +45,12 @@ class TwoSamples:
     @property
     def determined(self) -> bool:
         """Whether what both saw determines a pose in all directions."""
-        points, normals = self.source[self.common] / self.size, self.normals[self.common]
-        if not len(points):
+        common = self.common
+        if not common.any():
             return False
-        J = np.hstack([np.cross(points - points.mean(0), normals), normals])
-        least, *_, most = np.linalg.eigvalsh(J.T @ J)
+        points = self.source[common] / self.size
+        _, J = linearise(points, points, self.normals[common], points.mean(0))
+        least, *_, most = np.linalg.eigvalsh(J @ J.T)
         return bool(least > DETERMINED * most)
 
 

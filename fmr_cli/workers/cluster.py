@@ -105,7 +105,7 @@ class DaskWorkers:
                 self.client = distributed.Client(self.address, timeout=CONNECT, set_as_default=False)
             except Exception as error:  # what does not speak Dask's language is taken for a length of any size
                 why = "it speaks another language" if isinstance(error, MemoryError) else reason(error)
-                why = re.sub("^in <.*?>: ", "", why)[:120]  # a comm
+                why = re.sub("^in <.*?>: ", "", why)[:120]  # without the name of Dask's own connection
                 raise FmrError(
                     f"--dask {self.address}: no Dask scheduler answers there ({why}); check the port, which is not "
                     "the dashboard's, and whether it wants tls:// and certificates that it knows"
@@ -328,7 +328,7 @@ def check_certificates(address: str) -> None:
 
     remedy = "see distributed.comm.tls in Dask's configuration: ca-file, client.cert, client.key"
     files = [file for file in Security().get_tls_config_for_role("client").values() if file and "\n" not in file]
-    for file in files:  # what ssl says names none
+    for file in files:  # here, since the message of a library for TLS does not say which one
         try:
             open(file, "rb").close()
         except OSError as error:
