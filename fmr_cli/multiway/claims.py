@@ -23,6 +23,7 @@ CHANCE = 0.05  # that a wrong hypothesis agrees with another one, at least
 # Of 340 poses that ``align`` has found wrongly on the building of `python -m benchmarks.multiway` none has a
 # contradiction below 1.2; of the right ones half are below 0.1.
 CONFIRMS, ENOUGH = 4.6, 800  # log odds that views add to a pose that they find nothing against; points that must agree
+CLEAR = 0.5  # contradiction below which so many points confirm a pose
 UNLIKELY = 0.01  # confidence of a hypothesis, below which it speaks for nothing
 LEAST_CONFIDENT = 0.1  # of a hypothesis that counts once the network agrees with it
 SURE = 4.6  # log odds, at most, that ``align`` gives a hypothesis: of scans of a new kind it may misjudge one in 100
@@ -33,13 +34,14 @@ CERTAIN = 12.0  # log odds of a link that is given, and at most of all triangles
 class Claim:
     """One hypothesis of one link. log_odds: of its own; support: scan by scan, what the triangle over it adds.
 
-    sound: ``align`` is sure of it, or views confirm it.
+    sound: ``align`` is sure of it, or views confirm it; told: views have judged it.
     """
 
     link: int
     choice: int
     log_odds: float
     sound: bool
+    told: bool
     support: dict[int, float]
 
     def odds(self, inside: Container[int]) -> float:
@@ -63,7 +65,7 @@ def support(seen: Seen | None) -> float:
 
 def confirmed(h: Hypothesis, one_place: bool) -> bool:
     """Whether views alone make a pose sound that ``align`` is not sure of: so many points, so little against it."""
-    clear = h.seen is not None and h.seen.agreeing >= ENOUGH and h.seen.contradiction < 0.5
+    clear = h.seen is not None and h.seen.agreeing >= ENOUGH and h.seen.contradiction < CLEAR
     return one_place and h.firm and clear
 
 
@@ -135,7 +137,8 @@ def claims(links: list[Link], moments: dict[int, np.ndarray], scans: set[int], c
                         best = max(best, agreement(both(a, b), chance))
             if best:
                 support[k] = best
-        found.append(Claim(number, choice, odds, h.aligned or confirmed(h, link.source in scans), support))
+        told = link.source in scans
+        found.append(Claim(number, choice, odds, h.aligned or confirmed(h, told), told, support))
     return found
 
 

@@ -8,7 +8,7 @@ What hangs on one link alone, while another one that is about as sure has it els
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -18,6 +18,8 @@ import numpy as np
 from fmr_cli.multiway.claims import (
     AGREE,
     CHANCE,
+    CLEAR,
+    ENOUGH,
     Claim,
     agreeing,
     agreement,
@@ -28,16 +30,13 @@ from fmr_cli.multiway.claims import (
     log_odds,
     telling,
 )  # fmt: skip
+from fmr_cli.multiway.denials import denials
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
 from fmr_cli.multiway.parts import parts
 from fmr_cli.multiway.visibility import Seen, total
 
 JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
-DENIALS = (
-    (0.5, 3.0),
-    (0.3, 1.0),
-)  # at so much overlap a link that found nothing is e^-x as likely if the join is right
 RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
 MET = 10  # pairs of scans of two components whose views are compared before these are joined
 FLAGRANT = 4.0  # times what contradicts a pose, of one such pair alone, forbid a join; of all together, once
@@ -56,7 +55,7 @@ class Component:
 class Join:
     """A pose between two components. probability: that it is right; against: the probability of the best rival.
 
-    links: that agree on it, by number; sound: one is aligned by itself; denied: how many deny it.
+    links: that agree on it, by number; denied: how many deny it; sound: one is sure by itself, or views vouch for it.
     """
 
     T_second_first: np.ndarray
@@ -69,10 +68,7 @@ class Join:
 
     @property
     def holds(self) -> bool:
-        """Whether scans are joined by it: doubtful links never do so alone, however many agree.
-
-        Where two places resemble each other, all links between them are wrong in the same way.
-        """
+        """Whether scans are joined by it: doubtful links never do so alone, however many agree."""
         return self.sound and self.probability >= JOINED
 
 
@@ -99,6 +95,7 @@ def joined(
         components[first] = Component(dict(fixed.T_component_scan), set(fixed.held))
     scans = telling(links)
     chance = chance_of(links, scans)
+    against = denials(links, moments, overlap, scans)
     between: dict[tuple[int, int], list[Claim]] = defaultdict(list)
     for claim in claims(links, moments, scans, chance):
         a, b = sorted((home[links[claim.link].source], home[links[claim.link].target]))
@@ -114,9 +111,11 @@ def joined(
     refused: list[Join] = []
 
     def rivals(key: tuple[int, int], exact: bool) -> list[Join]:
+        if not between[key]:
+            return []
         tried = silent[key] if exact else []
         one, two = (components[n] for n in key)
-        return joins_between(one, two, links, between[key], tried, moments, overlap, chance) if between[key] else []
+        return joins_between(one, two, links, between[key], tried, moments, overlap, against, chance)
 
     def without_forbidden(key: tuple[int, int]) -> list[Join]:
         """The rivals that views allow; the others are refused for good, since components only grow."""
@@ -129,7 +128,10 @@ def joined(
             if forbidden(seen(met)):
                 refused.append(replace(join, denied=join.denied + len(met)))
                 between[key] = [claim for claim in between[key] if claim.link not in join.links]
-        return rivals(key, exact=True)
+        return [
+            replace(join, sound=join.sound or vouched(seen(meeting(one, two, join.T_second_first, scans, moments))))
+            for join in rivals(key, exact=True)
+        ]
 
     # Denials and views are dear to work out and can but lower a join's odds: only for the join whose turn it is.
     joins = {key: found[0] for key in between if (found := rivals(key, exact=False))}
@@ -264,6 +266,12 @@ def forbidden(seen: list[Seen]) -> bool:
     return bool(seen) and (total(seen).seen_through >= 1 or max(x.seen_through for x in seen) >= FLAGRANT)
 
 
+def vouched(seen: list[Seen]) -> bool:
+    """Whether scans that a join brings together see much of the same there, and hardly through each other."""
+    every = total(seen)
+    return every.agreeing >= ENOUGH and every.seen_through < CLEAR
+
+
 def meeting(
     first: Component, second: Component, T_second_first: np.ndarray, scans: set[int], moments: dict[int, np.ndarray]
 ) -> list[tuple[int, int, np.ndarray]]:
@@ -294,11 +302,14 @@ def joins_between(
     tried: list[int],
     moments: dict[int, np.ndarray],
     overlap: Callable[[int, int, np.ndarray], float],
+    against: Sequence[tuple[float, float]] = (),
     chance: float = CHANCE,
 ) -> list[Join]:
     """The poses between two components that most speaks for, best first; they share the probability.
 
-    some: the claims between the two; tried: links between them that may deny it, those that found nothing too.
+    some: the claims between the two; tried: links between them that may deny it, those that found nothing too;
+    against: what they say then, as of ``denials``. Doubtful links add nothing to each other, unless views have judged
+    them: where two places resemble each other, all links between them are wrong in the same way.
     """
     inside = first.T_component_scan.keys() | second.T_component_scan.keys()
     odds = {(c.link, c.choice): c.odds(inside) for c in some}
@@ -323,17 +334,18 @@ def joins_between(
                 agreed.setdefault(claim.link, claim)
         T_agreed = T_join[int(apart.argmin())]  # the pose in their middle: the lead may be a little wrong
         score = odds[ranked[lead].link, ranked[lead].choice]
-        score += sum(agreement(c.log_odds, chance) for n, c in agreed.items() if n != ranked[lead].link)
+        sound = any(claim.sound for claim in agreed.values())
+        if sound or any(claim.told for claim in agreed.values()):
+            score += sum(agreement(c.log_odds, chance) for n, c in agreed.items() if n != ranked[lead].link)
         denied = 0
         for number in [n for n in tried if n not in agreed][:DENIERS]:
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
             T = T_agreed if A is first else np.linalg.inv(T_agreed)
             shared = overlap(i, j, np.linalg.inv(B.T_component_scan[j]) @ T @ A.T_component_scan[i])
-            penalty = next((x for least, x in DENIALS if shared >= least), 0.0)
+            penalty = next((x for least, x in against if shared >= least), 0.0)
             denied += penalty > 0
             score -= penalty
-        sound = any(claim.sound for claim in agreed.values())
         best.append(Join(T_agreed, score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
     best.sort(key=lambda join: -join.log_odds)
     weights = np.exp(np.clip([join.log_odds for join in best], -50, 50))

@@ -18,7 +18,8 @@ from fmr_cli.multiway.scans import Scan
 from fmr_cli.registration import prepare
 from fmr_cli.registration.prepared import AT_MOST, Prepared
 
-CACHED_POINTS = 20_000_000  # of the scans kept at a time; about 2 GB with what is prepared from them
+CACHED_POINTS = 10_000_000  # of the scans kept at a time; about 1.5 GB with what is prepared from them
+PREPARED = 100_000  # points that take as much memory as what registering prepares of a scan: 10 to 20 MB
 SPILLED = 100_000  # points from which a file takes longer to read again than its thinned points do
 
 
@@ -79,11 +80,11 @@ class Store:
             self.spill.rmdir()
 
     def let_go(self) -> None:
-        """Lets go of the least recently used while more than CACHED_POINTS are kept."""
+        """Lets go of the least recently used while they take more than CACHED_POINTS do."""
         with self.lock:
             ready = {n: f.result() for n, f in self.kept.items() if f.done() and not f.exception()}
-            held = sum(len(r.points) for r in ready.values())
+            held = sum(len(r.points) + PREPARED for r in ready.values())
             for number, r in list(ready.items())[:-1]:
                 if held > CACHED_POINTS:
-                    held -= len(r.points)
+                    held -= len(r.points) + PREPARED
                     del self.kept[number]

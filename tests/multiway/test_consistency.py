@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fmr_cli.multiway.consistency import joined
+from fmr_cli.multiway.denials import denials
 from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.visibility import Seen
 
@@ -68,10 +69,55 @@ def test_doubtful_links_join_nothing_however_many_agree():
     links = [link(1, 0, 0.99), link(3, 2, 0.99), *(link(i, j, 0.45) for i in (2, 3) for j in (0, 1))]
     found, apart = components(4, links)
     assert members(found) == [[0, 1], [2, 3]]
-    assert apart[0, 1].probability > 0.9
+    assert apart[0, 1].probability < 0.5, "nor does their number make it likelier"
     assert len(apart[0, 1].links) == 4
     links[2] = link(2, 0, 0.6)
     assert members(components(4, links)[0]) == [[0, 1, 2, 3]], "one is sure, and the others agree"
+
+
+def test_doubtful_links_join_what_views_have_judged_and_vouch_for():
+    links = [link(1, 0, 0.99), link(3, 2, 0.99), *(link(i, j, 0.45) for i in (2, 3) for j in (0, 1))]
+    moments = dict.fromkeys(range(4), np.diag([90.0, 90.0, 90.0, 1.0]))
+    for x in links:
+        x.hypotheses[0].seen = Seen(0, 0, 100)
+    for agreeing, expected in ((300, [[0, 1, 2, 3]]), (100, [[0, 1], [2, 3]])):  # points, of each pair that meets
+
+        def views(pairs, agreeing=agreeing):
+            return [Seen(0, 0, agreeing) for _ in pairs]
+
+        assert members(joined(4, links, moments, lambda i, j, T: 0.0, seen=views)[0]) == expected
+
+
+def test_a_doubtful_rival_is_no_likelier_for_many_that_agree():
+    """A sure link says one thing, four doubtful ones of another place together something else."""
+    shift = np.eye(4)
+    shift[:3, 3] = 3.0
+    wrong = []
+    for i, j in ((2, 1), (3, 0), (3, 1), (2, 0)):
+        x = link(i, j, 0.4)
+        x.hypotheses[0].T_target_source = np.linalg.inv(WORLD[j]) @ shift @ WORLD[i]
+        wrong.append(x)
+    sure = link(2, 0, 0.76)
+    sure.hypotheses.append(wrong.pop().hypotheses[0])
+    found, _ = components(4, [link(1, 0, 0.99), link(3, 2, 0.99), sure, *wrong])
+    assert members(found) == [[0, 1, 2, 3]]
+    assert found[0].right
+
+
+def test_a_denial_weighs_as_much_as_pairs_that_overlap_are_seldom_missed():
+    """Of four pairs of a chain that overlap by half, as the scan between them tells, so many were not found."""
+
+    def chain(missed):
+        links = [link(n + 1, n, 0.99) for n in range(5)]
+        links += [link(n + 2, n, 0.01, right=None) if n < missed else link(n + 2, n, 0.9) for n in range(4)]
+        return denials(links, dict.fromkeys(range(6), MOMENT), lambda i, j, T: 0.6, set())
+
+    (half, seldom), (third, prior) = chain(0)
+    assert (half, third) == (0.5, 0.3)
+    assert seldom > 3.0
+    assert prior == pytest.approx(np.log(3)), "of pairs that overlap less nothing is known"
+    assert chain(3)[0][1] == pytest.approx(-np.log(3.5 / 16)), "the last one found tells of two more, which were found"
+    assert seldom > chain(1)[0][1] > chain(4)[0][1] > 0
 
 
 def test_a_cycle_chooses_among_the_poses_of_an_ambiguous_link():

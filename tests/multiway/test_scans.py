@@ -90,7 +90,7 @@ def test_links_and_poses_are_read(tmp_path):
 
 def test_memory_is_bounded_and_a_large_file_is_read_once(folder, monkeypatch):
     read = []
-    monkeypatch.setattr(store, "CACHED_POINTS", 130)
+    monkeypatch.setattr(store, "CACHED_POINTS", 130 + 2 * store.PREPARED)
     monkeypatch.setattr(store, "SPILLED", 50)
     original = store.read_cloud
     monkeypatch.setattr(store, "read_cloud", lambda path, **given: read.append(path.name) or original(path, **given))

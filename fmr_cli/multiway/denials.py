@@ -1,0 +1,58 @@
+"""What a pair that was tried and not found says against a join of components at which its scans would overlap.
+
+By Bayes' rule it lowers the odds by P(not found | the join is right) / P(not found | it is wrong). The latter is about
+1; the former is how often pairs that do overlap are missed, which differs from one kind of scan to another. So it is
+counted in the network: on pairs of which a third scan, linked surely to both, tells where they are.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+
+import numpy as np
+
+from fmr_cli.multiway.claims import AGREE, LEAST_CONFIDENT, contradicted
+from fmr_cli.multiway.links import Link
+from fmr_cli.multiway.looks import displacement
+
+# From this overlap up to the next; pairs that count as seen beforehand, and those of them that were missed: of scans
+# that register well one in twenty is missed at half overlap, one in three at a third.
+BANDS = ((0.5, 10.0, 0.5), (0.3, 3.0, 1.0))
+
+
+def denials(
+    links: list[Link],
+    moments: dict[int, np.ndarray],
+    overlap: Callable[[int, int, np.ndarray], float],
+    scans: set[int],
+) -> tuple[tuple[float, float], ...]:
+    """From which overlap on a pair that found nothing lowers the log odds of a join, and by how much.
+
+    moments (4, 4), overlap: as of ``consistency.joined``. scans: whose views tell.
+    """
+    sure: dict[int, dict[int, np.ndarray]] = defaultdict(dict)  # T_second_first
+    for link in links:
+        if link.status == "aligned" and not contradicted(link.hypotheses[0], link.source in scans):
+            T_target_source = link.hypotheses[0].T_target_source
+            sure[link.source][link.target] = T_target_source
+            sure[link.target][link.source] = np.linalg.inv(T_target_source)
+    tried, missed = ({least: 0 for least, _, _ in BANDS} for _ in range(2))
+    for link in links:
+        if link.status == "failed" or link.start in ("known", "pose"):  # of these the place was known beforehand
+            continue
+        i, j = link.ends
+        told = [sure[k][j] @ sure[i][k] for k in sorted(sure[i].keys() & sure[j].keys())]
+        shared = [overlap(i, j, T) for T in told]
+        band = next((least for least, _, _ in BANDS if max(shared, default=0.0) >= least), None)
+        if band is not None:
+            tried[band] += 1
+            missed[band] += not found(link, told[int(np.argmax(shared))], moments[i])
+    return tuple((least, -float(np.log((missed[least] + m) / (tried[least] + n)))) for least, n, m in BANDS)
+
+
+def found(link: Link, T_target_source: np.ndarray, moment: np.ndarray) -> bool:
+    """Whether a link has a pose that may be right, and is the one given."""
+    reach = AGREE * 1.5 * link.edge
+    likely = [h.T_target_source for h in link.hypotheses if h.confidence >= LEAST_CONFIDENT]
+    return any(float(displacement(T, T_target_source, moment)) < reach for T in likely)
