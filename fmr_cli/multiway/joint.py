@@ -22,7 +22,8 @@ from fmr_cli.multiway.workers import Threads
 from fmr_cli.registration.prepared import SPACINGS, Prepared
 
 FINER = 2.0  # times the grid on which pairs are registered
-REACHES = (1.0, 1.0, 0.7, 0.5, 0.5, 0.5)  # of that grid's edges, by round: how far a counterpart may lie
+REACHES = (1.0, 1.0, 0.7, 0.5)  # of that grid's edges, by round: how far a counterpart may lie; then as the last one
+ROUNDS = 20  # at most: what hangs on a narrow view comes near slowly
 POINTS = 6_000  # of a scan that are brought onto each of its partners
 PARTNERS = 8  # of a scan, those of most overlap first
 LEAST = 0.1  # overlap of a pair that takes part
@@ -102,7 +103,7 @@ def refine(
     place = {i: slice(6 * n, 6 * n + 6) for n, i in enumerate(free)}
     basis = {i: np.kron(np.eye(2), start[i][:3, :3]).T @ motion.basis() for i in free}  # what may move, in i's frame
     covariance, residual = {i: np.zeros((6, 6)) for i in poses}, dict.fromkeys(poses, float("nan"))
-    for factor in REACHES:
+    for factor in [*REACHES, *[REACHES[-1]] * (ROUNDS - len(REACHES))]:
 
         def system(pair: tuple[int, int], factor: float = factor) -> System | None:
             return linearised(

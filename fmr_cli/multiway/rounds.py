@@ -16,7 +16,7 @@ from fmr_cli.multiway.survey import Ends, Survey, nearest_pairs
 FIRST, NEXT = 3, 3  # promising pairs of a scan that are registered in the first round, of a component in each later one
 MANY, FIRST_OF_MANY = 50, 2  # scans from which rounds of joining are cheaper than a third pair for each at once
 NEAR = 16  # scans next to one in the network that may confirm where it is
-ROUNDS = 12  # of joining components, at most
+ROUNDS, IDLE = 12, 3  # of joining components, at most; of them in a row that join nothing, after which more seldom do
 CONFIRMED = 3  # links of a scan that stop the search for more
 SHARED = 0.3  # overlap at the network's poses from which an untried pair is worth registering
 ROUND_TRIP = 4  # links between two scans that overlap, from which one between them is worth it whatever they have
@@ -45,11 +45,14 @@ def register_most_promising(survey: Survey) -> None:
 
 def join_components(survey: Survey) -> None:
     """The most promising pairs that lead out of each component, until one is left or none is promising."""
+    fewest, idle = len(survey.components), 0
     for _ in range(ROUNDS):
         chosen = leading_out(survey, untried(survey, "look"), NEXT)
-        if len(survey.components) == 1 or not chosen:
+        if len(survey.components) == 1 or not chosen or idle == IDLE:
             return
         register_all(survey, [from_look(survey, *pair) for pair in sorted(chosen)])
+        idle = 0 if len(survey.components) < fewest else idle + 1
+        fewest = min(fewest, len(survey.components))
 
 
 def confirm(survey: Survey) -> None:
