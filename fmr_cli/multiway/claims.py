@@ -44,6 +44,11 @@ class Claim:
     told: bool
     support: dict[int, float]
 
+    @property
+    def likely(self) -> bool:
+        """Whether it is likelier right than wrong."""
+        return self.log_odds > 0
+
     def odds(self, inside: Container[int]) -> float:
         """With triangles over scans that are not ``inside`` what is joined: links to those are claims themselves."""
         return self.log_odds + min(sum(x for k, x in self.support.items() if k not in inside), CERTAIN)

@@ -37,7 +37,7 @@ from fmr_cli.multiway.parts import parts
 from fmr_cli.multiway.visibility import Seen, total
 
 JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
-RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other, and links that may deny each
+RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other; links that deny one, at most
 MET = 10  # pairs of scans of two components whose views are compared before these are joined
 FLAGRANT = 4.0  # times what contradicts a pose, of one such pair alone, forbid a join; of all together, once
 DISPUTED = 0.1  # probability that a link is the wrong one of a cycle, from which nothing hangs on it alone
@@ -309,7 +309,8 @@ def joins_between(
 
     some: the claims between the two; tried: links between them that may deny it, those that found nothing too;
     against: what they say then, as of ``denials``. Doubtful links add nothing to each other, unless views have judged
-    them: where two places resemble each other, all links between them are wrong in the same way.
+    them: where two places resemble each other, all links between them are wrong in the same way. Those that are
+    likelier wrong than right deny even what they agree with: of a right join, pairs that overlap much are found.
     """
     inside = first.T_component_scan.keys() | second.T_component_scan.keys()
     odds = {(c.link, c.choice): c.odds(inside) for c in some}
@@ -335,10 +336,11 @@ def joins_between(
         T_agreed = T_join[int(apart.argmin())]  # the pose in their middle: the lead may be a little wrong
         score = odds[ranked[lead].link, ranked[lead].choice]
         sound = any(claim.sound for claim in agreed.values())
-        if sound or any(claim.told for claim in agreed.values()):
-            score += sum(agreement(c.log_odds, chance) for n, c in agreed.items() if n != ranked[lead].link)
+        for n, claim in agreed.items():
+            if n != ranked[lead].link and (claim.told or (sound and claim.likely)):
+                score += agreement(claim.log_odds, chance)
         denied = 0
-        for number in [n for n in tried if n not in agreed][:DENIERS]:
+        for number in [n for n in tried if n not in agreed or not (agreed[n].told or agreed[n].likely)]:
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
             T = T_agreed if A is first else np.linalg.inv(T_agreed)
@@ -346,6 +348,8 @@ def joins_between(
             penalty = next((x for least, x in against if shared >= least), 0.0)
             denied += penalty > 0
             score -= penalty
+            if denied == DENIERS:
+                break
         best.append(Join(T_agreed, score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
     best.sort(key=lambda join: -join.log_odds)
     weights = np.exp(np.clip([join.log_odds for join in best], -50, 50))

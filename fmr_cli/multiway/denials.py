@@ -12,13 +12,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fmr_cli.multiway.claims import AGREE, LEAST_CONFIDENT, contradicted
+from fmr_cli.multiway.claims import AGREE, contradicted
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
 
 # From this overlap up to the next; pairs that count as seen beforehand, and those of them that were missed: of scans
 # that register well one in twenty is missed at half overlap, one in three at a third.
 BANDS = ((0.5, 10.0, 0.5), (0.3, 3.0, 1.0))
+LIKELY = 0.5  # confidence of a hypothesis that is likelier right than wrong
 
 
 def denials(
@@ -52,7 +53,7 @@ def denials(
 
 
 def found(link: Link, T_target_source: np.ndarray, moment: np.ndarray) -> bool:
-    """Whether a link has a pose that may be right, and is the one given."""
+    """Whether a link has a pose that is likely, and is the one given."""
     reach = AGREE * 1.5 * link.edge
-    likely = [h.T_target_source for h in link.hypotheses if h.confidence >= LEAST_CONFIDENT]
+    likely = [h.T_target_source for h in link.hypotheses if h.confidence > LIKELY]
     return any(float(displacement(T, T_target_source, moment)) < reach for T in likely)

@@ -58,10 +58,11 @@ def align_many(
         look_at_pairs(survey)
         register_most_promising(survey)
         join_components(survey)
+        confirm(survey)
         for _ in range(PORTIONS - 1):
             if len(survey.components) > 1 and look_further(survey):
                 join_components(survey)
-        confirm(survey)
+                confirm(survey)
         for most in (LONE, math.inf):  # lone scans are few, and often what joins the others
             if len(survey.components) > 1 and look_by_planes(survey, most):
                 join_components(survey)

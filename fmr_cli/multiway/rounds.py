@@ -11,7 +11,7 @@ import numpy as np
 from fmr_cli.multiway.candidates import alike_first, leading_out, untried
 from fmr_cli.multiway.consistency import Component
 from fmr_cli.multiway.registering import Attempt, attempt, from_look, register_all
-from fmr_cli.multiway.survey import Ends, Survey, nearest_pairs
+from fmr_cli.multiway.survey import Ends, Survey, ends_of, nearest_pairs
 
 FIRST, NEXT = 3, 3  # promising pairs of a scan that are registered in the first round, of a component in each later one
 MANY, FIRST_OF_MANY = 50, 2  # scans from which rounds of joining are cheaper than a third pair for each at once
@@ -56,7 +56,7 @@ def join_components(survey: Survey) -> None:
 
 
 def confirm(survey: Survey) -> None:
-    """Pairs that overlap at the network's poses, for scans with few links and where they close a round trip."""
+    """Pairs that overlap at the network's poses: for scans with few links, round trips, and links that stand alone."""
     for _ in range(2):
         attempts = [task for component in survey.components for task in worth_confirming(survey, component)]
         if not attempts:
@@ -68,12 +68,13 @@ def worth_confirming(survey: Survey, component: Component) -> list[Attempt]:
     """At most two pairs a scan of a component, those that share most first."""
     poses = component.T_component_scan
     members = sorted(poses)
-    steps = links_between(survey, members)
-    degree = {n: sum(1 for m in members if steps.get((n, m)) == 1) for n in members}
+    near = aligned_with(survey, members)
+    steps = links_between(near)
+    beside = beside_lone_links(near)
     found = []
     for i, j in nearest_pairs(poses, NEAR):
-        few = min(degree[i], degree[j]) < CONFIRMED or steps.get((i, j), ROUND_TRIP) >= ROUND_TRIP
-        if few and (i, j) not in survey.links and survey.possible(i, j):
+        few = min(len(near[i]), len(near[j])) < CONFIRMED or steps.get((i, j), ROUND_TRIP) >= ROUND_TRIP
+        if (few or (i, j) in beside) and (i, j) not in survey.links and survey.possible(i, j):
             T = np.linalg.inv(poses[j]) @ poses[i]
             shared = survey.overlap(i, j, T)
             if shared >= SHARED:
@@ -87,21 +88,35 @@ def worth_confirming(survey: Survey, component: Component) -> list[Attempt]:
     return chosen
 
 
-def links_between(survey: Survey, members: list[int]) -> dict[tuple[int, int], int]:
-    """How many aligned links lie between scans, where fewer than ROUND_TRIP."""
+def aligned_with(survey: Survey, members: list[int]) -> dict[int, set[int]]:
+    """By scan of a component, those that aligned links join it to."""
     near: dict[int, set[int]] = {n: set() for n in members}
     for (i, j), link in survey.links.items():
         if link.status == "aligned" and i in near and j in near:
             near[i].add(j)
             near[j].add(i)
+    return near
+
+
+def links_between(near: dict[int, set[int]]) -> dict[Ends, int]:
+    """How many aligned links lie between scans, where fewer than ROUND_TRIP."""
     found = {}
-    for n in members:
+    for n in near:
         seen, front = {n}, {n}
         for step in range(1, ROUND_TRIP):
             front = {m for k in front for m in near[k]} - seen
             seen |= front
             found.update({(n, m): step for m in front})
     return found
+
+
+def beside_lone_links(near: dict[int, set[int]]) -> set[Ends]:
+    """Pairs of a scan, or one next to it, at either end of an aligned link that no third scan confirms.
+
+    Such a link may be wrong and join places that resemble each other; then these pairs overlap there but don't fit.
+    """
+    lone = [(i, j) for i in near for j in near[i] if i < j and not near[i] & near[j]]
+    return {ends_of(a, b) for i, j in lone for a in {i} | near[i] for b in {j} | near[j] if a != b}
 
 
 def try_dear_starts(survey: Survey) -> bool:
