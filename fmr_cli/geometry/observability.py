@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.geometry.kernels import NORMAL, geman_mcclure, geman_mcclure_slope
@@ -140,22 +141,26 @@ def about(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return M.T @ information @ M
 
 
-def undetermined(info: np.ndarray, length: float, basis: np.ndarray | None = None) -> list[str]:
+def undetermined(info: np.ndarray, points: np.ndarray, basis: np.ndarray | None = None) -> list[str]:
     """The directions that the scans hardly determine, in words: those WEAK against the strongest.
 
-    info: (6, 6); length: turns radians into the unit, so that both kinds of motion compare; basis: (6, d) orthonormal
-    twists that the motion may use, None for all six.
+    Motions compare by how far they move a scan's points, root mean square: along a street a roll moves them little.
+    info: (6, 6) of the twist about the scan's centre; points (N, 3): of the scan, about its centre, in the same axes;
+    basis: (6, d) orthonormal twists that the motion may use, None for all six.
     """
-    S = np.diag([1 / length] * 3 + [1.0] * 3)
     B = np.eye(6) if basis is None else basis
-    values, vectors = np.linalg.eigh(B.T @ S @ info @ S @ B)
+    second = points.T @ points / len(points)
+    moved = np.eye(6)  # mean square displacement of the points by a twist x is xᵀ moved x
+    moved[:3, :3] = np.trace(second) * (1 + 1e-6) * np.eye(3) - second
+    values, vectors = eigh(B.T @ info @ B, B.T @ moved @ B)
     said = []
     for value, vector in zip(values, (B @ vectors).T, strict=True):
         if value > WEAK * max(values[-1], 1e-300):
             continue
         omega, v = vector[:3], vector[3:]
-        axis = omega if np.linalg.norm(omega) > np.linalg.norm(v) else v
-        kind = "rotation about" if np.linalg.norm(omega) > np.linalg.norm(v) else "shift along"
+        turns = omega @ moved[:3, :3] @ omega > v @ v  # more than it shifts
+        axis = omega if turns else v
+        kind = "rotation about" if turns else "shift along"
         said.append(f"{kind} {direction(axis)}")
     return said
 

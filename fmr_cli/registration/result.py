@@ -97,8 +97,9 @@ def describe(
     T[:3, :3] *= factor
     certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3))
     rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
-    centre, extent = smaller(pair, best.T_target_source)
-    weak = observability.undetermined(observability.about(certain.information, centre), extent, in_use(pair))
+    points = smaller(pair, best.T_target_source)
+    centre = points.mean(0)
+    weak = observability.undetermined(observability.about(certain.information, centre), points - centre, in_use(pair))
     aligned = best.confidence >= ALIGNED and not weak
     reasons = [f"the scans do not determine: {'; '.join(weak)}"] if weak else []
     alternatives = [
@@ -136,16 +137,13 @@ def describe(
     )
 
 
-def smaller(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,), in the target's centred frame, and half extent of the cloud that reaches less far.
+def smaller(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+    """The points (N, 3) of the cloud that reaches less far, in the target's centred frame.
 
     What a turn does is seen there: about the far centre of a map, a scan's turn is hardly told from its shift.
     """
-    centres = pair.s.points.mean(0), pair.t.points.mean(0)
-    extents = [float(np.abs(x.points - c).max()) for x, c in zip((pair.s, pair.t), centres, strict=True)]
-    if extents[0] < extents[1]:
-        return transform_points(T_target_source, centres[0][None])[0], extents[0]
-    return centres[1], extents[1]
+    source, target = (np.abs(x.points - x.points.mean(0)).max() for x in (pair.s, pair.t))
+    return transform_points(T_target_source, pair.s.points) if source < target else pair.t.points
 
 
 def in_use(pair: Pair) -> np.ndarray:

@@ -49,7 +49,7 @@ def test_what_a_shape_does_not_determine_is_named(shape, said: set[str]) -> None
     points = shape()
     source, target = (Surface(shaken(points, seed), 0.1) for seed in (0, 1))
     info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
-    weak = observability.undetermined(info, 2.0)
+    weak = observability.undetermined(info, target.points)
     assert len(weak) == len(said)
     kinds = sorted(w.split(" (")[0] for w in weak)
     assert kinds == sorted(s.split(" (")[0] for s in said)
@@ -63,7 +63,20 @@ def test_a_room_determines_everything(room_scans: Scans) -> None:
     assert info.shape == (6, 6)
     np.testing.assert_allclose(info, info.T, rtol=1e-9, atol=1e-9 * np.abs(info).max())
     assert np.linalg.eigvalsh(info).min() > 0
-    assert observability.undetermined(info, 2.0) == []
+    assert observability.undetermined(info, target.points - target.points.mean(0)) == []
+
+
+def test_along_a_street_a_roll_is_determined_as_far_as_it_moves_anything() -> None:
+    """60 m of road and low walls beside it: a roll moves no point by more than its few metres from the middle."""
+    rng = np.random.default_rng(2)
+    road = np.column_stack([rng.uniform(-30, 30, 9000), rng.uniform(-2, 2, 9000), np.zeros(9000)])
+    walls = np.column_stack([rng.uniform(-30, 30, 9000), rng.choice([-2.0, 2.0], 9000), rng.uniform(0, 1, 9000)])
+    ends = np.column_stack([rng.choice([-30.0, 30.0], 3000), rng.uniform(-2, 2, 3000), rng.uniform(0, 1, 3000)])
+    street = np.vstack([road, walls, ends])
+    source, target = (Surface(street + rng.normal(0, 0.01, street.shape), 0.3) for _ in "ab")
+    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
+    centre = target.points.mean(0)
+    assert observability.undetermined(observability.about(info, centre), target.points - centre) == []
 
 
 def test_more_noise_is_less_information() -> None:
@@ -103,7 +116,9 @@ def test_a_turn_is_seen_about_the_scan_however_far_the_map_s_centre_is(room_scan
     near = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
     away = np.array([80.0, 30.0, 0.0])
     far = observability.certainty(source, target, np.eye(4), away).information
-    assert observability.undetermined(far, 2.0)
+    points = target.points - target.points.mean(0)
+    assert observability.undetermined(far, points)
+    assert not observability.undetermined(observability.about(far, -away), points)
     np.testing.assert_allclose(observability.about(far, -away), near, rtol=1e-6, atol=1e-6 * np.abs(near).max())
 
 
