@@ -117,21 +117,20 @@ def joined(
         one, two = (components[n] for n in key)
         return joins_between(one, two, links, between[key], tried, moments, overlap, against, chance)
 
-    def without_forbidden(key: tuple[int, int]) -> list[Join]:
-        """The rivals that views allow; the others are refused for good, since components only grow."""
+    def views(key: tuple[int, int], join: Join) -> list[Seen]:
         one, two = (components[n] for n in key)
-        scans_of_both = one.T_component_scan.keys() | two.T_component_scan.keys()
+        return seen(meeting(one, two, join.T_second_first, scans, moments))
+
+    def judged(key: tuple[int, int]) -> list[Join]:
+        """The rivals that views allow; the others are refused for good, since components only grow."""
+        scans_of_both = components[key[0]].T_component_scan.keys() | components[key[1]].T_component_scan.keys()
         if any(link.start == "known" and scans_of_both.issuperset(link.ends) for link in links):  # whatever views say
             return rivals(key, exact=True)
         for join in rivals(key, exact=True):
-            met = meeting(one, two, join.T_second_first, scans, moments)
-            if forbidden(seen(met)):
+            if forbidden(met := views(key, join)):
                 refused.append(replace(join, denied=join.denied + len(met)))
                 between[key] = [claim for claim in between[key] if claim.link not in join.links]
-        return [
-            replace(join, sound=join.sound or vouched(seen(meeting(one, two, join.T_second_first, scans, moments))))
-            for join in rivals(key, exact=True)
-        ]
+        return [replace(x, sound=x.sound or vouched(views(key, x))) for x in rivals(key, exact=True)]
 
     # Denials and views are dear to work out and can but lower a join's odds: only for the join whose turn it is.
     joins = {key: found[0] for key in between if (found := rivals(key, exact=False))}
@@ -148,7 +147,7 @@ def joined(
         a, b = -a, -b
         if (a, b) not in exact:
             del joins[a, b]
-            for join in without_forbidden((a, b))[:1]:
+            for join in judged((a, b))[:1]:
                 joins[a, b] = join
             exact.add((a, b))
             continue
