@@ -18,7 +18,7 @@ from fmr_cli.multiway.scans import Scan
 from fmr_cli.registration import prepare
 from fmr_cli.registration.prepared import AT_MOST, Prepared
 
-CACHED_POINTS = 10_000_000  # of the scans kept at a time; about 1.5 GB with what is prepared from them
+CACHED_POINTS = 20_000_000  # of the scans kept at a time; about 3 GB with what is prepared from them, at most
 PREPARED = 100_000  # points that take as much memory as what registering prepares of a scan: 10 to 20 MB
 SPILLED = 100_000  # points from which a file takes longer to read again than its thinned points do
 
