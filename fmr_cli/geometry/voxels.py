@@ -8,10 +8,15 @@ BITS = 21  # of a voxel's index along an axis: three times 21 fit an int64
 
 
 def voxel_downsample(points: np.ndarray, edge: float) -> np.ndarray:
-    """The mean of the points in each occupied voxel: (N, 3) -> (M, 3), in a fixed order (single-threaded)."""
+    """The mean of the points in each occupied voxel: (N, 3) -> (M, 3), in a fixed order (single-threaded).
+
+    In a unit near the edge: small_gicp takes none below a millionth. A power of two changes no bit of the result.
+    """
     import small_gicp
 
-    return np.asarray(small_gicp.voxelgrid_sampling(points, edge, num_threads=1).points())[:, :3].copy()
+    unit = 2.0 ** np.ceil(np.log2(edge))
+    grid = small_gicp.voxelgrid_sampling(points / unit, edge / unit, num_threads=1)
+    return unit * np.asarray(grid.points())[:, :3]
 
 
 def occupied_voxels(points: np.ndarray, edge: float) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -57,6 +57,7 @@ def test_the_pose_follows_a_motion_of_either_cloud(clouds, plain, X, Y):
 
 
 @FEW
+@example(exponent=-6.0)
 @given(exponent=st.floats(-6, 6))
 def test_the_pose_follows_a_change_of_unit(clouds, plain, exponent):
     unit = 10.0**exponent
