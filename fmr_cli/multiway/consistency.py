@@ -37,7 +37,8 @@ from fmr_cli.multiway.parts import parts
 from fmr_cli.multiway.visibility import Seen, total
 
 JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
-RIVALS, DENIERS = 3, 12  # poses of a join that are weighed against each other; links that deny one, at most
+RIVALS = 3  # poses of a join that are weighed against each other
+HOPELESS = -10.0  # log odds at which no more is asked that could speak against a join
 MET = 10  # pairs of scans of two components whose views are compared before these are joined
 FLAGRANT = 4.0  # times what contradicts a pose, of one such pair alone, forbid a join; of all together, once
 DISPUTED = 0.1  # probability that a link is the wrong one of a cycle, from which nothing hangs on it alone
@@ -347,7 +348,7 @@ def joins_between(
             penalty = next((x for least, x in against if shared >= least), 0.0)
             denied += penalty > 0
             score -= penalty
-            if denied == DENIERS:
+            if score < HOPELESS:
                 break
         best.append(Join(T_agreed, score, 0.0, 0.0, tuple(sorted(agreed)), denied, sound))
     best.sort(key=lambda join: -join.log_odds)

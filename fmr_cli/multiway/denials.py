@@ -2,7 +2,8 @@
 
 By Bayes' rule it lowers the odds by P(not found | the join is right) / P(not found | it is wrong). The latter is about
 1; the former is how often pairs that do overlap are missed, which differs from one kind of scan to another. So it is
-counted in the network: on pairs of which a third scan, linked surely to both, tells where they are.
+counted in the network: on pairs of which a third scan, linked surely to both, tells where they are. Sure links that no
+other confirms tell nothing here: a wrong one makes all pairs beside it look as if they were missed.
 """
 
 from __future__ import annotations
@@ -38,12 +39,13 @@ def denials(
             T_target_source = link.hypotheses[0].T_target_source
             sure[link.source][link.target] = T_target_source
             sure[link.target][link.source] = np.linalg.inv(T_target_source)
+    told_by = {i: {k for k in sure[i] if sure[i].keys() & sure[k].keys()} for i in sure}
     tried, missed = ({least: 0 for least, _, _ in BANDS} for _ in range(2))
     for link in links:
         if link.status == "failed" or link.start in ("known", "pose"):  # of these the place was known beforehand
             continue
         i, j = link.ends
-        told = [sure[k][j] @ sure[i][k] for k in sorted(sure[i].keys() & sure[j].keys())]
+        told = [sure[k][j] @ sure[i][k] for k in sorted(told_by.get(i, set()) & told_by.get(j, set()))]
         shared = [overlap(i, j, T) for T in told]
         band = next((least for least, _, _ in BANDS if max(shared, default=0.0) >= least), None)
         if band is not None:

@@ -22,7 +22,7 @@ def pose(seed: int) -> np.ndarray:
     return T
 
 
-WORLD = [pose(n) for n in range(6)]
+WORLD = [pose(n) for n in range(14)]
 
 
 def link(source: int, target: int, *confidences: float, right: int | None = 0) -> Link:
@@ -104,20 +104,41 @@ def test_a_doubtful_rival_is_no_likelier_for_many_that_agree():
     assert found[0].right
 
 
-def test_a_denial_weighs_as_much_as_pairs_that_overlap_are_seldom_missed():
-    """Of four pairs of a chain that overlap by half, as the scan between them tells, so many were not found."""
+def test_a_few_sure_links_between_places_alike_do_not_outweigh_the_many_that_find_nothing():
+    """Two streets of seven scans: five links between them are sure, and wrong in the same way; 44 pairs don't fit."""
+    shift = np.eye(4)
+    shift[:3, 3] = 3.0
+    across = [link(i, j, 0.8) if (i + 3 * j) % 10 == 0 else link(i, j, 0.01, right=None)
+              for i in range(7, 14) for j in range(7)]  # fmt: skip
+    for x in across:
+        if x.status == "aligned":
+            x.hypotheses[0].T_target_source = np.linalg.inv(WORLD[x.target]) @ shift @ WORLD[x.source]
+    chains = [link(n + 1, n, 0.99) for n in range(13) if n != 6]
+    assert sum(x.status == "aligned" for x in across) == 5
+    assert members(components(14, [*chains, *across], overlap=0.0)[0]) == [[*range(14)]], "if they would not overlap"
+    assert members(components(14, [*chains, *across], overlap=0.4)[0]) == [[*range(7)], [*range(7, 14)]]
 
-    def chain(missed):
-        links = [link(n + 1, n, 0.99) for n in range(5)]
-        links += [link(n + 2, n, 0.01, right=None) if n < missed else link(n + 2, n, 0.9) for n in range(4)]
+
+def test_a_denial_weighs_as_much_as_pairs_that_overlap_are_seldom_missed():
+    """Of fifteen pairs of six scans that overlap by half, as a third scan tells, so many were not found."""
+
+    def six(missed):
+        pairs = [(i, j) for i in range(6) for j in range(i)]
+        links = [link(i, j, 0.01, right=None) if n < missed else link(i, j, 0.9) for n, (i, j) in enumerate(pairs)]
         return denials(links, dict.fromkeys(range(6), MOMENT), lambda i, j, T: 0.6, set())
 
-    (half, seldom), (third, prior) = chain(0)
+    (half, seldom), (third, prior) = six(0)
     assert (half, third) == (0.5, 0.3)
-    assert seldom > 3.0
+    assert seldom == pytest.approx(-np.log(0.5 / 25))
     assert prior == pytest.approx(np.log(3)), "of pairs that overlap less nothing is known"
-    assert chain(3)[0][1] == pytest.approx(-np.log(3.5 / 16)), "the last one found tells of two more, which were found"
-    assert seldom > chain(1)[0][1] > chain(4)[0][1] > 0
+    assert six(3)[0][1] == pytest.approx(-np.log(3.5 / 25))
+
+
+def test_a_wrong_link_that_nothing_confirms_does_not_make_pairs_look_missed():
+    links = [link(1, 0, 0.99), link(2, 1, 0.99), link(3, 2, 0.99, right=None), link(3, 1, 0.01), link(3, 0, 0.01)]
+    assert denials(links, dict.fromkeys(range(4), MOMENT), lambda i, j, T: 0.6, set())[0][1] == pytest.approx(
+        -np.log(0.05)
+    )
 
 
 def test_a_cycle_chooses_among_the_poses_of_an_ambiguous_link():
