@@ -8,7 +8,7 @@ What hangs on one link alone, while another one that is about as sure has it els
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -30,7 +30,7 @@ from fmr_cli.multiway.claims import (
     log_odds,
     telling,
 )  # fmt: skip
-from fmr_cli.multiway.denials import denials
+from fmr_cli.multiway.denials import Denials, denials
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
 from fmr_cli.multiway.parts import parts
@@ -38,6 +38,7 @@ from fmr_cli.multiway.visibility import Seen, total
 
 JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
 RIVALS = 3  # poses of a join that are weighed against each other
+STAYS = 0.3  # chance that a pair that is tried from a wrong pose, of places that look alike, ends there again
 HOPELESS = -10.0  # log odds at which no more is asked that could speak against a join
 MET = 10  # pairs of scans of two components whose views are compared before these are joined
 FLAGRANT = 4.0  # times what contradicts a pose, of one such pair alone, forbid a join; of all together, once
@@ -302,7 +303,7 @@ def joins_between(
     tried: list[int],
     moments: dict[int, np.ndarray],
     overlap: Callable[[int, int, np.ndarray], float],
-    against: Sequence[tuple[float, float]] = (),
+    against: Denials = Denials(),
     chance: float = CHANCE,
 ) -> list[Join]:
     """The poses between two components that most speaks for, best first; they share the probability.
@@ -338,14 +339,14 @@ def joins_between(
         sound = any(claim.sound for claim in agreed.values())
         for n, claim in agreed.items():
             if n != ranked[lead].link and (claim.told or (sound and claim.likely)):
-                score += agreement(claim.log_odds, chance)
+                score += agreement(claim.log_odds, chance if links[n].start != "pose" else max(chance, STAYS))
         denied = 0
         for number in [n for n in tried if n not in agreed or not (agreed[n].told or agreed[n].likely)]:
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
             T = T_agreed if A is first else np.linalg.inv(T_agreed)
             shared = overlap(i, j, np.linalg.inv(B.T_component_scan[j]) @ T @ A.T_component_scan[i])
-            penalty = next((x for least, x in against if shared >= least), 0.0)
+            penalty = against.of(links[number], shared)
             denied += penalty > 0
             score -= penalty
             if score < HOPELESS:

@@ -9,7 +9,8 @@ other confirms tell nothing here: a wrong one makes all pairs beside it look as 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,9 +19,27 @@ from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
 
 # From this overlap up to the next; pairs that count as seen beforehand, and those of them that were missed: of scans
-# that register well one in twenty is missed at half overlap, one in three at a third.
+# that register well one in twenty is missed at half overlap, one in three at a third; next to none from its own pose.
 BANDS = ((0.5, 10.0, 0.5), (0.3, 3.0, 1.0))
+POSED = ((0.5, 10.0, 0.5), (0.3, 10.0, 0.5))
 LIKELY = 0.5  # confidence of a hypothesis that is likelier right than wrong
+
+Weights = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Denials:
+    """From which overlap on a pair that found nothing lowers the log odds of a join, and by how much.
+
+    sought: where the pair had to be found; posed: where it was tried from the very pose at which it would overlap.
+    """
+
+    sought: Weights = ()
+    posed: Weights = ()
+
+    def of(self, link: Link, shared: float) -> float:
+        """What a link that found nothing says against a join at which its scans share so much."""
+        return next((x for least, x in (self.posed if link.start == "pose" else self.sought) if shared >= least), 0.0)
 
 
 def denials(
@@ -28,10 +47,10 @@ def denials(
     moments: dict[int, np.ndarray],
     overlap: Callable[[int, int, np.ndarray], float],
     scans: set[int],
-) -> tuple[tuple[float, float], ...]:
-    """From which overlap on a pair that found nothing lowers the log odds of a join, and by how much.
+) -> Denials:
+    """How often pairs that overlap are missed, as weights. moments (4, 4), overlap: as of ``consistency.joined``.
 
-    moments (4, 4), overlap: as of ``consistency.joined``. scans: whose views tell.
+    scans: whose views tell.
     """
     sure: dict[int, dict[int, np.ndarray]] = defaultdict(dict)  # T_second_first
     for link in links:
@@ -40,18 +59,23 @@ def denials(
             sure[link.source][link.target] = T_target_source
             sure[link.target][link.source] = np.linalg.inv(T_target_source)
     told_by = {i: {k for k in sure[i] if sure[i].keys() & sure[k].keys()} for i in sure}
-    tried, missed = ({least: 0 for least, _, _ in BANDS} for _ in range(2))
-    for link in links:
-        if link.status == "failed" or link.start in ("known", "pose"):  # of these the place was known beforehand
-            continue
-        i, j = link.ends
-        told = [sure[k][j] @ sure[i][k] for k in sorted(told_by.get(i, set()) & told_by.get(j, set()))]
-        shared = [overlap(i, j, T) for T in told]
-        band = next((least for least, _, _ in BANDS if max(shared, default=0.0) >= least), None)
-        if band is not None:
-            tried[band] += 1
-            missed[band] += not found(link, told[int(np.argmax(shared))], moments[i])
-    return tuple((least, -float(np.log((missed[least] + m) / (tried[least] + n)))) for least, n, m in BANDS)
+
+    def weights(some: Iterable[Link], bands: tuple[tuple[float, float, float], ...]) -> Weights:
+        tried, missed = ({least: 0 for least, _, _ in bands} for _ in range(2))
+        for link in some:
+            i, j = link.ends
+            told = [sure[k][j] @ sure[i][k] for k in sorted(told_by.get(i, set()) & told_by.get(j, set()))]
+            shared = [overlap(i, j, T) for T in told]
+            band = next((least for least, _, _ in bands if max(shared, default=0.0) >= least), None)
+            if band is not None:
+                tried[band] += 1
+                missed[band] += not found(link, told[int(np.argmax(shared))], moments[i])
+        return tuple((least, -float(np.log((missed[least] + m) / (tried[least] + n)))) for least, n, m in bands)
+
+    tried = [x for x in links if x.status != "failed" and x.start != "known"]
+    return Denials(
+        weights((x for x in tried if x.start != "pose"), BANDS), weights((x for x in tried if x.start == "pose"), POSED)
+    )
 
 
 def found(link: Link, T_target_source: np.ndarray, moment: np.ndarray) -> bool:

@@ -125,7 +125,7 @@ def test_a_denial_weighs_as_much_as_pairs_that_overlap_are_seldom_missed():
     def six(missed):
         pairs = [(i, j) for i in range(6) for j in range(i)]
         links = [link(i, j, 0.01, right=None) if n < missed else link(i, j, 0.9) for n, (i, j) in enumerate(pairs)]
-        return denials(links, dict.fromkeys(range(6), MOMENT), lambda i, j, T: 0.6, set())
+        return denials(links, dict.fromkeys(range(6), MOMENT), lambda i, j, T: 0.6, set()).sought
 
     (half, seldom), (third, prior) = six(0)
     assert (half, third) == (0.5, 0.3)
@@ -136,9 +136,25 @@ def test_a_denial_weighs_as_much_as_pairs_that_overlap_are_seldom_missed():
 
 def test_a_wrong_link_that_nothing_confirms_does_not_make_pairs_look_missed():
     links = [link(1, 0, 0.99), link(2, 1, 0.99), link(3, 2, 0.99, right=None), link(3, 1, 0.01), link(3, 0, 0.01)]
-    assert denials(links, dict.fromkeys(range(4), MOMENT), lambda i, j, T: 0.6, set())[0][1] == pytest.approx(
-        -np.log(0.05)
-    )
+    counted = denials(links, dict.fromkeys(range(4), MOMENT), lambda i, j, T: 0.6, set()).sought
+    assert counted[0][1] == pytest.approx(-np.log(0.05))
+
+
+def test_a_pair_tried_from_its_pose_denies_more_and_confirms_less():
+    """Between places that look alike: what begins at the pose ends there, if it fits at all."""
+    chains, across = [link(1, 0, 0.99), link(3, 2, 0.99)], [link(2, 0, 0.8), link(3, 1, 0.8)]
+    silent = [Link(i, j, "uncertain", "look", [Hypothesis(pose(77), 0.001)], np.eye(6), 0.4, 0.01, EDGE)
+              for i, j in ((3, 0), (2, 1))]  # fmt: skip
+    links = [*chains, *across, *silent]
+    assert members(components(4, links, overlap=0.4)[0]) == [[0, 1, 2, 3]]
+    for x in silent:
+        x.start = "pose"
+    assert members(components(4, links, overlap=0.4)[0]) == [[0, 1], [2, 3]]
+    across = [link(2, 0, 0.6), link(3, 1, 0.6)]
+    links = [*chains, *across, silent[0]]
+    assert members(components(4, links, overlap=0.4)[0]) == [[0, 1, 2, 3]]
+    across[0].start = across[1].start = "pose"
+    assert members(components(4, links, overlap=0.4)[0]) == [[0, 1], [2, 3]]
 
 
 def test_a_cycle_chooses_among_the_poses_of_an_ambiguous_link():
