@@ -345,8 +345,8 @@ def joins_between(
             i, j = links[number].ends
             A, B = (first, second) if i in first.T_component_scan else (second, first)
             T = T_agreed if A is first else np.linalg.inv(T_agreed)
-            shared = overlap(i, j, np.linalg.inv(B.T_component_scan[j]) @ T @ A.T_component_scan[i])
-            penalty = against.of(links[number], shared)
+            T_ji = np.linalg.inv(B.T_component_scan[j]) @ T @ A.T_component_scan[i]
+            penalty = against.of(links[number], overlap(i, j, T_ji), T_ji, moments[i])
             denied += penalty > 0
             score -= penalty
             if score < HOPELESS:

@@ -23,6 +23,7 @@ from fmr_cli.multiway.looks import displacement
 BANDS = ((0.5, 10.0, 0.5), (0.3, 3.0, 1.0))
 POSED = ((0.5, 10.0, 0.5), (0.3, 10.0, 0.5))
 LIKELY = 0.5  # confidence of a hypothesis that is likelier right than wrong
+NEARBY = 20.0  # voxel edges that a registration moves from where it begins, hardly ever more
 
 Weights = tuple[tuple[float, float], ...]
 
@@ -31,15 +32,16 @@ Weights = tuple[tuple[float, float], ...]
 class Denials:
     """From which overlap on a pair that found nothing lowers the log odds of a join, and by how much.
 
-    sought: where the pair had to be found; posed: where it was tried from the very pose at which it would overlap.
+    sought: where the pair had to be found; posed: where it was tried from the pose at which it would overlap, or near.
     """
 
     sought: Weights = ()
     posed: Weights = ()
 
-    def of(self, link: Link, shared: float) -> float:
-        """What a link that found nothing says against a join at which its scans share so much."""
-        return next((x for least, x in (self.posed if link.start == "pose" else self.sought) if shared >= least), 0.0)
+    def of(self, link: Link, shared: float, T_target_source: np.ndarray, moment: np.ndarray) -> float:
+        """What a link that found nothing says against a pose (4, 4) at which its scans share so much."""
+        weights = self.posed if link.start == "pose" and begun_near(link, T_target_source, moment) else self.sought
+        return next((x for least, x in weights if shared >= least), 0.0)
 
 
 def denials(
@@ -76,6 +78,12 @@ def denials(
     return Denials(
         weights((x for x in tried if x.start != "pose"), BANDS), weights((x for x in tried if x.start == "pose"), POSED)
     )
+
+
+def begun_near(link: Link, T_target_source: np.ndarray, moment: np.ndarray) -> bool:
+    """Whether a link that was tried from a pose began near the one given, by where it ended: it moves a little."""
+    reach = NEARBY * link.edge
+    return any(float(displacement(h.T_target_source, T_target_source, moment)) < reach for h in link.hypotheses)
 
 
 def found(link: Link, T_target_source: np.ndarray, moment: np.ndarray) -> bool:

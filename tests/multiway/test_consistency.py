@@ -143,13 +143,18 @@ def test_a_wrong_link_that_nothing_confirms_does_not_make_pairs_look_missed():
 def test_a_pair_tried_from_its_pose_denies_more_and_confirms_less():
     """Between places that look alike: what begins at the pose ends there, if it fits at all."""
     chains, across = [link(1, 0, 0.99), link(3, 2, 0.99)], [link(2, 0, 0.8), link(3, 1, 0.8)]
-    silent = [Link(i, j, "uncertain", "look", [Hypothesis(pose(77), 0.001)], np.eye(6), 0.4, 0.01, EDGE)
-              for i, j in ((3, 0), (2, 1))]  # fmt: skip
+    silent = [link(3, 0, 0.001), link(2, 1, 0.001)]
+    for x in silent:
+        x.hypotheses[0].T_target_source[:3, 3] += 0.3  # six voxel edges from where the others have it
+        x.start = "look"
     links = [*chains, *across, *silent]
     assert members(components(4, links, overlap=0.4)[0]) == [[0, 1, 2, 3]]
-    for x in silent:
-        x.start = "pose"
+    silent[0].start = silent[1].start = "pose"
     assert members(components(4, links, overlap=0.4)[0]) == [[0, 1], [2, 3]]
+    for x in silent:
+        x.hypotheses[0].T_target_source[:3, 3] += 5.0
+    assert members(components(4, links, overlap=0.4)[0]) == [[0, 1, 2, 3]], "from another pose, which says little here"
+    silent[0].hypotheses[0].T_target_source[:3, 3] -= 5.0
     across = [link(2, 0, 0.6), link(3, 1, 0.6)]
     links = [*chains, *across, silent[0]]
     assert members(components(4, links, overlap=0.4)[0]) == [[0, 1, 2, 3]]
