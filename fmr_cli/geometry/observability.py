@@ -15,8 +15,8 @@ from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_keys
 
 WEAK = 2e-3  # of the strongest direction's information: what the noise of the normals alone pretends to
-# The same of a whole pair, for how far a direction moves the scan: of made-up spheres, cylinders and corridors of 2,000
-# points and more up to 0.0045, of right pairs of sparse street scans from 0.010.
+# The same of a whole pair, for how far a direction moves the scan: of spheres, cylinders and corridors of 2,000 points
+# and more up to 0.0045, of right pairs of the street of `python -m benchmarks.multiway` from 0.010.
 HARDLY = 5e-3
 REACH = 1.5  # voxel edges: correspondences further apart are no observations
 BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated, those of two blocks not

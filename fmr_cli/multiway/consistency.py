@@ -17,7 +17,6 @@ import numpy as np
 
 from fmr_cli.multiway.claims import (
     AGREE,
-    CHANCE,
     CLEAR,
     ENOUGH,
     Claim,
@@ -36,9 +35,9 @@ from fmr_cli.multiway.looks import displacement
 from fmr_cli.multiway.parts import parts
 from fmr_cli.multiway.visibility import Seen, total
 
-JOINED = 0.5  # probability from which scans are joined, if one link is aligned by itself
+JOINED = 0.5  # probability from which scans are joined, if one link is sure by itself, or views vouch for it
 RIVALS = 3  # poses of a join that are weighed against each other
-STAYS = 0.3  # chance that a pair that is tried from a wrong pose, of places that look alike, ends there again
+STAYS = 0.3  # chance, assumed, that a pair that is tried from a wrong pose, of places that look alike, ends there again
 HOPELESS = -10.0  # log odds at which no more is asked that could speak against a join
 MET = 10  # pairs of scans of two components whose views are compared before these are joined
 FLAGRANT = 4.0  # times what contradicts a pose, of one such pair alone, forbid a join; of all together, once
@@ -303,8 +302,8 @@ def joins_between(
     tried: list[int],
     moments: dict[int, np.ndarray],
     overlap: Callable[[int, int, np.ndarray], float],
-    against: Denials = Denials(),
-    chance: float = CHANCE,
+    against: Denials,
+    chance: float,
 ) -> list[Join]:
     """The poses between two components that most speaks for, best first; they share the probability.
 

@@ -17,13 +17,14 @@ import numpy as np
 from fmr_cli.multiway.claims import AGREE, contradicted
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.looks import displacement
+from fmr_cli.multiway.parts import in_triangles
 
 # From this overlap up to the next; pairs that count as seen beforehand, and those of them that were missed: of scans
-# that register well one in twenty is missed at half overlap, one in three at a third; next to none from its own pose.
+# that register well one in twenty is missed at half overlap, one in three at a third; from its own pose, one in twenty.
 BANDS = ((0.5, 10.0, 0.5), (0.3, 3.0, 1.0))
 POSED = ((0.5, 10.0, 0.5), (0.3, 10.0, 0.5))
 LIKELY = 0.5  # confidence of a hypothesis that is likelier right than wrong
-NEARBY = 20.0  # voxel edges that a registration moves from where it begins, hardly ever more
+NEARBY = 20.0  # voxel edges that a registration is taken to move from where it begins, at most
 
 Weights = tuple[tuple[float, float], ...]
 
@@ -60,7 +61,7 @@ def denials(
             T_target_source = link.hypotheses[0].T_target_source
             sure[link.source][link.target] = T_target_source
             sure[link.target][link.source] = np.linalg.inv(T_target_source)
-    told_by = {i: {k for k in sure[i] if sure[i].keys() & sure[k].keys()} for i in sure}
+    told_by = in_triangles({i: sure[i].keys() for i in sure})
 
     def weights(some: Iterable[Link], bands: tuple[tuple[float, float, float], ...]) -> Weights:
         tried, missed = ({least: 0 for least, _, _ in bands} for _ in range(2))

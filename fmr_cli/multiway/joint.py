@@ -103,7 +103,8 @@ def refine(
     place = {i: slice(6 * n, 6 * n + 6) for n, i in enumerate(free)}
     basis = {i: np.kron(np.eye(2), start[i][:3, :3]).T @ motion.basis() for i in free}  # what may move, in i's frame
     covariance, residual = {i: np.zeros((6, 6)) for i in poses}, dict.fromkeys(poses, float("nan"))
-    for factor in [*REACHES, *[REACHES[-1]] * (ROUNDS - len(REACHES))]:
+    for turn in range(ROUNDS):
+        factor = REACHES[min(turn, len(REACHES) - 1)]
 
         def system(pair: tuple[int, int], factor: float = factor) -> System | None:
             return linearised(

@@ -10,6 +10,7 @@ import numpy as np
 
 from fmr_cli.multiway.candidates import alike_first, leading_out, untried
 from fmr_cli.multiway.consistency import Component
+from fmr_cli.multiway.parts import in_triangles
 from fmr_cli.multiway.registering import Attempt, attempt, from_look, register_all
 from fmr_cli.multiway.survey import Ends, Survey, ends_of, nearest_pairs
 
@@ -115,7 +116,8 @@ def beside_lone_links(near: dict[int, set[int]]) -> set[Ends]:
 
     Such a link may be wrong and join places that resemble each other; then these pairs overlap there but don't fit.
     """
-    lone = [(i, j) for i in near for j in near[i] if i < j and not near[i] & near[j]]
+    confirmed = in_triangles(near)
+    lone = [(i, j) for i in near for j in near[i] - confirmed[i] if i < j]
     return {ends_of(a, b) for i, j in lone for a in {i} | near[i] for b in {j} | near[j] if a != b}
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from fmr_cli.geometry import observability
 from fmr_cli.geometry.point_to_plane import point_to_plane, step_motion
+from fmr_cli.geometry.sampling import working_scale
 from fmr_cli.geometry.se3 import log
 from fmr_cli.geometry.surface import Surface
 
@@ -77,6 +78,38 @@ def test_along_a_street_a_roll_is_determined_as_far_as_it_moves_anything() -> No
     info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
     centre = target.points.mean(0)
     assert observability.undetermined(observability.about(info, centre), target.points - centre) == []
+
+
+def ball(rng: np.random.Generator) -> np.ndarray:
+    points = rng.normal(size=(2000, 3))
+    return points / np.linalg.norm(points, axis=1)[:, None]
+
+
+def pipe(rng: np.random.Generator) -> np.ndarray:
+    angle = rng.uniform(0, 2 * np.pi, 2000)
+    return np.column_stack([np.cos(angle), np.sin(angle), rng.uniform(-5, 5, 2000)])
+
+
+def passage(rng: np.random.Generator) -> np.ndarray:
+    """Two walls, floor and ceiling, 20 m long."""
+    points = rng.uniform([-10, -1, 0], [10, 1, 2.6], (2000, 3))
+    across = np.arange(2000) % 4
+    points[across < 2, 1] = np.where(across[across < 2] == 0, -1.0, 1.0)
+    points[across >= 2, 2] = np.where(across[across >= 2] == 2, 0.0, 2.6)
+    return points
+
+
+@pytest.mark.parametrize(("shape", "said"), [(ball, "rotation"), (pipe, "shift along"), (passage, "shift along")])
+def test_few_points_that_fall_differently_determine_no_more(shape, said: str) -> None:
+    """Two samples of one shape: their normals' errors pretend to know what the shape leaves open."""
+    source, target = (
+        Surface(points, working_scale(points, np.random.default_rng(0))[0])
+        for points in (shape(np.random.default_rng(seed)) for seed in (0, 1))
+    )
+    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
+    centre = target.points.mean(0)
+    weak = observability.undetermined(observability.about(info, centre), target.points - centre)
+    assert any(w.startswith(said) for w in weak)
 
 
 def test_more_noise_is_less_information() -> None:
