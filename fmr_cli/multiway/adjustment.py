@@ -8,8 +8,8 @@ import numpy as np
 
 from fmr_cli.cloud import angle_degrees
 from fmr_cli.geometry.frames import leave_frames
-from fmr_cli.multiway import claims, consistency, joint, looks, pose_graph
-from fmr_cli.multiway.consistency import Component, Join
+from fmr_cli.multiway import claims, joint, looks, pose_graph
+from fmr_cli.multiway.components import Component, Join, homes
 from fmr_cli.multiway.links import Link
 from fmr_cli.multiway.network import Apart, Network, Placed
 from fmr_cli.multiway.pose_graph import Factor, Prior, Solution
@@ -151,7 +151,7 @@ def anchor_of(survey: Survey, component: Component, used: list[Link]) -> int:
 
 def still_joined(component: Component, links: list[Link]) -> bool:
     """Whether links join all scans of a component; scans that don't move are one."""
-    return len(set(consistency.homes(component, [link.ends for link in links]).values())) == 1
+    return len(set(homes(component, [link.ends for link in links]).values())) == 1
 
 
 def mean_pose(poses: list[np.ndarray]) -> np.ndarray:

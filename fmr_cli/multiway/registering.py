@@ -14,7 +14,7 @@ from fmr_cli.geometry.frames import enter_frames, leave_frames
 from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.io.files import reason
 from fmr_cli.multiway import claims, consistency
-from fmr_cli.multiway.consistency import Component
+from fmr_cli.multiway.components import Component
 from fmr_cli.multiway.links import Hypothesis, Link, best_of, key_of
 from fmr_cli.multiway.looks import best_of as best_look
 from fmr_cli.multiway.scans import Scan

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from fmr_cli.multiway.candidates import alike_first, leading_out, untried
-from fmr_cli.multiway.consistency import Component
+from fmr_cli.multiway.components import Component
 from fmr_cli.multiway.parts import in_triangles
 from fmr_cli.multiway.registering import Attempt, attempt, from_look, register_all
 from fmr_cli.multiway.survey import Ends, Survey, ends_of, nearest_pairs

@@ -19,7 +19,7 @@ from fmr_cli.errors import FmrError
 from fmr_cli.geometry.frames import Frame, enter_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.multiway import claims, looks, visibility
-from fmr_cli.multiway.consistency import Component, Join
+from fmr_cli.multiway.components import Component, Join
 from fmr_cli.multiway.known import ROUGH_DEGREES, ROUGH_SHARE, Known, number_of, poses_in_file
 from fmr_cli.multiway.links import Journal, Link
 from fmr_cli.multiway.pose_graph import Prior
