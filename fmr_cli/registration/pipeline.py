@@ -57,7 +57,13 @@ def align(
     Raises RegistrationError where a cloud cannot be registered at all, ModelError for the model or the device, FmrError
     for options that contradict each other.
     """
-    found = as_they_are(source, target, options, threads, check)
+    time = Stopwatch()
+    with one_blas_thread(), time.stage("prepare"), ThreadPoolExecutor(threads) as pool:
+        prepared, target = pool.map(
+            lambda x: x if isinstance(x, Prepared) else prepare(x, options.seed), (source, target)
+        )
+    check_systems(prepared, target)
+    found = as_they_are(prepared, target, options, threads, check, time)
     aligned = found.status == "aligned"
     if aligned and mirror.unlikely(found):
         return found
@@ -70,7 +76,7 @@ def align(
         return found
     if options.allow_mirror:
         image = mirror.image(source, options.seed)
-        other = as_they_are(image, target, options, threads, check)
+        other = as_they_are(image, target, options, threads, check, Stopwatch())
         return mirror.undone(other, image.centre) if other.status == "aligned" else found
     if fits and hints:
         found.warnings.append(mirror.HINT.format(fits.confidence))
@@ -78,7 +84,7 @@ def align(
 
 
 def mirror_look(
-    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, thorough: bool = True
+    source: PointCloud | Prepared, target: Prepared, options: Options, thorough: bool = True
 ) -> Candidate | None:
     """How the mirror image of the source fits the target, where a quick look is sure that it does.
 
@@ -88,7 +94,6 @@ def mirror_look(
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):
         image = mirror.image(source, options.seed)
-        target = target if isinstance(target, Prepared) else prepare(target, options.seed)
         for detail in (FIRST, FURTHER[0]):
             judge = Judge(make_pair(image, target, options, 2, *detail))
             consider(judge, features(judge.pair, time), time)
@@ -100,16 +105,10 @@ def mirror_look(
 
 
 def as_they_are(
-    source: PointCloud | Prepared, target: PointCloud | Prepared, options: Options, threads: int, check: bool
+    source: Prepared, target: Prepared, options: Options, threads: int, check: bool, time: Stopwatch
 ) -> Registration:
     """``align`` without a mirror."""
-    time = Stopwatch()
     with one_blas_thread():
-        with time.stage("prepare"), ThreadPoolExecutor(threads) as pool:
-            source, target = pool.map(
-                lambda x: x if isinstance(x, Prepared) else prepare(x, options.seed), (source, target)
-            )
-        check_systems(source, target)
         verdicts: list[tuple[float, Judge]] = []
         for factor, given in scales(source, target, options):
             scaled = source if factor == 1.0 else source.scaled(factor)

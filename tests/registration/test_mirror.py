@@ -14,7 +14,7 @@ from fmr_cli.io import read_transform, write_transform
 from fmr_cli.io.transforms import as_transform
 from fmr_cli.registration import Options, align, mirror
 from fmr_cli.registration.mirror import MIRROR
-from fmr_cli.registration.pipeline import mirror_look
+from fmr_cli.registration.pipeline import mirror_look, prepare
 from fmr_cli.registration.units import factor_of
 from fmr_cli.vectors import turn_vectors
 
@@ -30,7 +30,7 @@ def test_a_mirrored_scan_is_found_on_request_only(tmp_path: Path, clouds: tuple[
     plain = align(source, target)
     assert plain.status != "aligned"
     assert any("the mirror image of the source fits" in said for said in plain.warnings)
-    assert mirror_look(PointCloud(points), target, Options()) is None
+    assert mirror_look(PointCloud(points), prepare(target), Options()) is None
     found = align(source, target, Options(allow_mirror=True))
     assert (found.status, found.mirrored) == ("aligned", True)
     assert np.linalg.det(found.T_target_source[:3, :3]) == pytest.approx(-1)
@@ -44,7 +44,7 @@ def test_a_mirrored_scan_is_found_on_request_only(tmp_path: Path, clouds: tuple[
 def test_where_the_mirror_image_fits_better_a_pose_is_not_believed(clouds: tuple[np.ndarray, PointCloud]) -> None:
     points, target = clouds
     right = align(PointCloud(points), target)
-    image = mirror_look(PointCloud(points * [1, -1, 1]), target, Options())
+    image = mirror_look(PointCloud(points * [1, -1, 1]), prepare(target), Options())
     assert right.status == "aligned"
     assert mirror.unlikely(right)
     assert image is not None
