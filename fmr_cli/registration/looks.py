@@ -22,7 +22,8 @@ REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
 FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
-FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000))  # the looks after it, while none is sure
+FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000), (2.8, 1000))  # the looks after it, while none is sure
+COARSE = 2.0  # from which a look's poses are too rough to be refined on the voxels that they are judged on
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 
 log = logging.getLogger(__name__)
@@ -51,7 +52,11 @@ def further(
         for coarseness, keypoints in FURTHER:
             with suppress(RegistrationError):
                 seen = pair if coarseness == 1.0 else make_pair(source, target, options, threads, coarseness, keypoints)
-                consider(judge, features(seen, time), time)
+                found = features(seen, time)
+                if coarseness >= COARSE:
+                    with time.stage("refine"):
+                        found = [replace(h, T_target_source=refinement.refined(seen, h)) for h in found[:REFINED]]
+                consider(judge, found, time)
             if judge.sure(enough):
                 return judge
     if options.init == "search" or (options.init == "auto" and not likely(judge) and may_overlap_fully(pair)):

@@ -182,6 +182,8 @@ class Odometry:
             return best
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
+        if found.status != "aligned" and self.usual and not self._usual(by_features):
+            return best  # a leap that nothing vouches for: a passage's corner fits another in several ways
         best = min(best, by_features, key=lambda fit: fit.total)
         if found.status != "aligned":
             return best

@@ -7,9 +7,11 @@ import pytest
 from simulation import drive, make_street, scan
 
 from fmr_cli.io import read_cloud, read_poses
+from fmr_cli.sequence import align_sequence
 from fmr_cli.sequence.odometry import Odometry
 from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
+from fmr_cli.synthetic.drives import Drive, Way, passages, spinning
 
 REFERENCE = "reference_poses.txt"
 
@@ -57,6 +59,24 @@ def test_backwards_and_every_third_scan(turning, every):
     frames = run(scans[::every])
     assert all(frame.status == "aligned" for frame in frames)
     assert errors(frames, truth[::every])[0] < 0.004
+
+
+class Corner(Drive):
+    """The third corner of a round of passages."""
+
+    @property
+    def seconds(self):
+        return super().seconds[215:237]
+
+
+@pytest.mark.slow
+def test_at_a_corner_that_fits_itself_in_several_ways_no_leap_is_taken():
+    scene, corners = passages(np.random.default_rng(0), 36, 24, 2.4, 0.0)
+    sensor = spinning(16, -15, 15, 900, 60.0)
+    corner = Corner(scene, Way(corners, 1.2, wobble=1.0), sensor, 5.0, seed=2)
+    poses, truth = align_sequence(list(corner.scans())).poses, corner.truth()
+    found, true = (np.linalg.inv(path[:-1]) @ path[1:] for path in (poses, truth))
+    assert np.abs(found - true)[:, :3, 3].max() < 0.1
 
 
 def test_the_unit_and_the_place_do_not_matter(turning, first_four):
