@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated,
 BENDS = 8.0  # independent parts of a scan that is bent or drifted as a whole: half an extent each
 # Counted as left of a direction without a block: without the one block that alone holds it, nothing would be.
 LEFT = 1e-3
-BIAS = 1.0  # residuals' sigmas: of a range bias, beforehand; sensors' data sheets give accuracy and noise of one size
+BIAS = 1.0  # points' sigmas: of a range bias, beforehand; sensors' data sheets give accuracy and noise of one size
 LEAST_BLOCKS = 8  # fewer say nothing about the scatter of their sums
 
 
@@ -39,8 +40,19 @@ class Certainty:
     covariance: np.ndarray
 
 
-def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, origin: np.ndarray) -> Certainty:
+def certainty(
+    source: Surface,
+    target: Surface,
+    T_target_source: np.ndarray,
+    origin: np.ndarray,
+    noise: Sequence[float] = (0.0, 0.0),
+    eyes: Sequence[np.ndarray | None] = (None, None),
+) -> Certainty:
     """Of the twist in the target's frame about ``origin`` (3,), by point-to-plane at a pose, both ways.
+
+    noise: the deviation of single points of source and target from their surface, own unit. eyes: (3,) where their
+    sensors were, each in its own frame, None where that isn't known: the middle of the points then, as a scanner that
+    looks all round has it.
 
     The covariance is that of a robust estimate of correlated observations (Huber's sandwich, by blocks: Liang and Zeger
     1986). With the pull ψ = w r of a residual and its slope ψ' by r, D = Σ ψ' J Jᵀ and g_b = Σ ψ J over block b of
@@ -52,7 +64,10 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     there are BENDS.
     """
     seen, misfits = [], []
-    centres = transform_points(T_target_source, source.points.mean(0)[None])[0], target.points.mean(0)
+    source_eye, target_eye = (
+        cloud.points.mean(0) if eye is None else eye for cloud, eye in zip((source, target), eyes, strict=True)
+    )
+    source_eye = transform_points(T_target_source, source_eye[None])[0]
     back = np.linalg.inv(T_target_source)
     for a, b, T, swapped in ((source, target, T_target_source, False), (target, source, back, True)):
         moved = transform_points(T, a.points)
@@ -65,7 +80,7 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
             x, y, n = transform_points(T_target_source, y), a.points[here], n @ T_target_source[:3, :3].T
         r, J = linearise(x, y, n, origin)
         scale2 = (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * b.edge) ** 2
-        outward = np.stack([outwards(x, n, centres[0]), -outwards(y, n, centres[1])])
+        outward = np.stack([outwards(x, n, source_eye), -outwards(y, n, target_eye)])
         seen.append(np.vstack([r, geman_mcclure(r * r, scale2), geman_mcclure_slope(r * r, scale2), J, y.T, outward]))
         misfits.append(NORMAL**2 * (np.median(np.abs(r)) ** 2 - np.median(b.unevenness[0][match[here]]) ** 2))
     if not seen:
@@ -79,7 +94,7 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     inverse = pseudo_inverse(A / np.outer(units, units))
     covariance = inverse * w.sum() * max(sum(misfits), 0.0) / 2 / BENDS
     block, index = np.unique(voxel_keys(y, BLOCK * target.edge), return_inverse=True)
-    covariance += range_bias(J, outward, w, r, inverse, variance, len(r) / len(block))
+    covariance += range_bias(J, outward, w, r, inverse, variance, BIAS * np.asarray(noise), len(r) / len(block))
     if len(block) >= LEAST_BLOCKS:
         covariance += sandwich(J, w * r, slope, index)
     else:
@@ -87,9 +102,9 @@ def certainty(source: Surface, target: Surface, T_target_source: np.ndarray, ori
     return Certainty(A / 2 / variance, covariance / np.outer(units, units))
 
 
-def outwards(points: np.ndarray, normals: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """How far points (N, 3) move along their normals where all move one unit away from a scan's centre (3,)."""
-    away = points - centre
+def outwards(points: np.ndarray, normals: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """How far points (N, 3) move along their normals where all move one unit away from an eye (3,)."""
+    away = points - eye
     return np.einsum("ni,ni->n", away, normals) / np.maximum(np.linalg.norm(away, axis=1), 1e-300)
 
 
@@ -100,20 +115,22 @@ def range_bias(
     r: np.ndarray,
     inverse: np.ndarray,
     variance: float,
+    sigma: np.ndarray,
     together: float,
 ) -> np.ndarray:
     """What ranges that are all too long or too short by one length add to a pose's covariance (6, 6).
 
     The biases are parameters that the pose was found without (Schmidt's consider parameters): J (6, N) and outward
     (2, N; of source and target) are the residuals' derivatives. How large they are the residuals tell, where surfaces
-    face each other, as both sides of a street; where they don't, no more than BIAS is known. inverse: (6, 6) of Σ w J
-    Jᵀ; variance: of a residual; together: how many of them are one observation.
+    face each other, as both sides of a street; where they don't, no more than sigma (2,; of source and target) is
+    known. inverse: (6, 6) of Σ w J Jᵀ; variance: of a residual; together: how many of them are one observation.
     """
     cross = (J * w) @ outward.T
     to_pose = inverse @ cross
     known = (outward * w) @ outward.T - cross.T @ to_pose
     pull = outward @ (w * r) - to_pose.T @ (J @ (w * r))
-    spread = np.linalg.inv(known / together + np.eye(2) / BIAS**2)  # in units of the residuals' variance
+    before = np.diag(variance / np.maximum(sigma**2, 1e-12 * variance))
+    spread = np.linalg.inv(known / together + before)  # in units of the residuals' variance
     bias = spread @ pull / together
     return to_pose @ (variance * spread + np.outer(bias, bias)) @ to_pose.T
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -35,19 +37,28 @@ def planes_through(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[
     return points - off[:, None] * normals, normals, deviation, np.maximum(distance[:, -1], 1e-300)
 
 
-def roughness(points: np.ndarray, wide: int) -> tuple[float, float]:
-    """How rough small neighbourhoods of points (N, 3) are, and whether that is noise: medians over some of them.
+@dataclass(frozen=True)
+class Roughness:
+    """How rough the small neighbourhoods of a cloud are, and whether that is noise: medians over some of them.
 
-    The roughness by ``local_planes``: 0.05 is clean, 0.2 noisy, or so sparse that 10 neighbours show the shape. And by
-    what factor the deviation grows from these to ``wide`` neighbours: noise is as large over any neighbourhood (up to
-    the root of the numbers' ratio, where it is larger than the neighbourhoods), while at a crease the deviation grows
-    as their radius, on a bend as its square.
+    share: the roughness by ``local_planes``: 0.05 is clean, 0.2 noisy, or so sparse that 10 neighbours show the shape.
+    growth: by what factor the deviation grows from these to wide neighbourhoods: noise is as large over any (up to the
+    root of the numbers' ratio, where it is larger than the neighbourhoods), while at a crease the deviation grows as
+    their radius, on a bend as its square. deviation: of the small neighbourhoods, own unit.
     """
+
+    share: float
+    growth: float
+    deviation: float
+
+
+def roughness(points: np.ndarray, wide: int) -> Roughness:
+    """Of points (N, 3); wide: neighbours of a wide neighbourhood."""
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     some = points[:: max(len(points) // PROBES, 1)]
     near, radius = planes_through(some, tree, NEAR)[2:]
-    rough = float(np.median(near / radius))
+    share, deviation = float(np.median(near / radius)), float(np.median(near))
     if wide >= tree.n:
-        return rough, np.inf
+        return Roughness(share, np.inf, deviation)
     far = planes_through(some, tree, wide)[2]
-    return rough, float(np.median(far / np.maximum(near, 1e-300)))
+    return Roughness(share, float(np.median(far / np.maximum(near, 1e-300))), deviation)

@@ -13,7 +13,7 @@ from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.gicp import GicpCloud
 from fmr_cli.geometry.planar import plane_of, raised
 from fmr_cli.geometry.sampling import distinct, reach, sample, thinned, working_scale
-from fmr_cli.geometry.smoothing import roughness
+from fmr_cli.geometry.smoothing import Roughness, roughness
 from fmr_cli.geometry.strays import Strays, strays
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.geometry.voxels import voxel_downsample
@@ -57,6 +57,7 @@ class Prepared:
                 f"{cloud.name}: {len(points)} distinct points, registration needs {MIN_POINTS}; give a denser scan"
             )
         self.name, self.read, self.seed, self.crs = cloud.name, cloud.count, seed, cloud.crs
+        self.sensor_origin = cloud.sensor_origin
         if cloud.crs and in_degrees(cloud.crs, cloud.points.min(0), cloud.points.max(0)):
             raise RegistrationError(
                 f"{cloud.name}: is in degrees ({name_of(cloud.crs)}), which are no lengths: project it first, "
@@ -77,6 +78,11 @@ class Prepared:
         """(3,) where the centred coordinates have their origin, file's coordinates."""
         return self.frame.origin
 
+    @property
+    def eye(self) -> np.ndarray | None:
+        """(3,) where the sensor was, centred coordinates; None where the file doesn't state it."""
+        return None if self.sensor_origin is None else self.frame.enter(self.sensor_origin[None])[0]
+
     def part(self, inside: np.ndarray) -> Prepared:
         """The points ``inside`` (N,) alone, in a centred frame of their own; what is said of the cloud stays."""
         part = copy(self)
@@ -87,7 +93,8 @@ class Prepared:
 
     def scaled(self, factor: float) -> Prepared:
         """The same cloud with every length multiplied by ``factor``."""
-        return Prepared(PointCloud(self.frame.leave(self.points) * factor), self.seed)
+        origin = None if self.sensor_origin is None else self.sensor_origin * factor
+        return Prepared(PointCloud(self.frame.leave(self.points) * factor, sensor_origin=origin), self.seed)
 
     def surface(self, edge: float) -> Surface:
         """The centred cloud on a voxel grid of ``edge``."""
@@ -112,8 +119,8 @@ class Prepared:
 
         return self._fine.get((count, edge), thin)
 
-    def roughness(self, count: int, edge: float, wide: int) -> tuple[float, float]:
-        """Of ``fine``: about 0.05 on clean scans, from 0.1 on noisy ones or sparse, and its growth (``smoothing``)."""
+    def roughness(self, count: int, edge: float, wide: int) -> Roughness:
+        """Of ``fine``."""
         return self._roughness.get((count, edge), lambda: roughness(self.fine(count, edge), wide))
 
     def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> GicpCloud:

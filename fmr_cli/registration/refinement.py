@@ -16,7 +16,7 @@ from fmr_cli.geometry.planar import within_plane
 from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_plane, step_motion, with_scale
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.se3 import exp
-from fmr_cli.geometry.smoothing import NEAR, local_planes
+from fmr_cli.geometry.smoothing import NEAR, Roughness, local_planes
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.pair import RANKING_POINTS, Pair
@@ -124,7 +124,7 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     T = gicp_in_reach(pair, s, pair.target.for_gicp(GICP_TARGET, edge, pair.threads), T_target_source)
     if noisy(pair):
         any_motion = np.eye(6)
-        clean_source, clean_target = (roughness < CLEAN for roughness, _ in roughnesses(pair))
+        clean_source, clean_target = (cloud.share < CLEAN for cloud in roughnesses(pair))
         if clean_target:  # onto a clean scan's own planes, which smoothing would bend
             T = constrained(s, t, T, edge, any_motion, False)
         elif clean_source:
@@ -140,12 +140,12 @@ def noisy(pair: Pair) -> bool:
 
     Not where they are so sparse that their neighbourhoods show its shape: wider ones would cut its corners.
     """
-    rough = [growth for roughness, growth in roughnesses(pair) if roughness > ROUGH]
+    rough = [cloud.growth for cloud in roughnesses(pair) if cloud.share > ROUGH]
     return bool(rough) and max(rough) < NOISE_GROWTH
 
 
-def roughnesses(pair: Pair) -> list[tuple[float, float]]:
-    """Of source and target, see ``geometry.smoothing.roughness``."""
+def roughnesses(pair: Pair) -> list[Roughness]:
+    """Of source and target."""
     clouds = ((pair.source, GICP_SOURCE), (pair.target, GICP_TARGET))
     return [cloud.roughness(count, pair.edge, SMOOTHED_OVER) for cloud, count in clouds]
 

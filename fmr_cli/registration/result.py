@@ -20,6 +20,7 @@ from fmr_cli.registration.confidence import ALIGNED, LIKELY, Candidate, doubts
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair
 from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.refinement import roughnesses
 
 RIVALLING = 0.1  # of the best one's weight, that an alternative has at least
 
@@ -95,7 +96,9 @@ def describe(
     """
     T = pair.leave_centred(best.T_target_source)
     T[:3, :3] *= factor
-    certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3))
+    noise = [cloud.deviation for cloud in roughnesses(pair)]
+    eyes = (pair.source.eye, pair.target.eye)
+    certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3), noise, eyes)
     rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
     points = smaller(pair, best.T_target_source)
     centre = points.mean(0)

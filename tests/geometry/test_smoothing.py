@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 
 from fmr_cli.geometry.smoothing import local_planes, roughness
@@ -15,16 +16,21 @@ def ball(noise: float) -> np.ndarray:
 
 
 def test_noise_is_rough_and_a_curved_surface_is_not() -> None:
-    assert roughness(ball(0.0), 30)[0] < 0.05
-    assert roughness(ball(0.05), 30)[0] > 0.15
+    assert roughness(ball(0.0), 30).share < 0.05
+    assert roughness(ball(0.05), 30).share > 0.15
+
+
+def test_the_deviation_is_that_of_the_noise() -> None:
+    assert roughness(ball(0.01), 30).deviation == pytest.approx(0.01, rel=0.3)
+    assert roughness(10 * ball(0.01), 30).deviation == pytest.approx(0.1, rel=0.3)
 
 
 def test_noise_does_not_grow_with_the_neighbourhood_and_shape_does() -> None:
-    assert roughness(ball(0.05), 30)[1] < 3**0.5
-    rough, growth = roughness(ball(0.0)[:150], 30)  # so sparse that ten neighbours see the bend
-    assert rough > 0.05
-    assert growth > 2
-    assert roughness(ball(0.0)[:20], 30)[1] == np.inf
+    assert roughness(ball(0.05), 30).growth < 3**0.5
+    sparse = roughness(ball(0.0)[:150], 30)  # ten neighbours see the bend
+    assert sparse.share > 0.05
+    assert sparse.growth > 2
+    assert roughness(ball(0.0)[:20], 30).growth == np.inf
 
 
 def test_points_come_nearer_to_the_surface() -> None:
