@@ -1,7 +1,9 @@
 """Places seen before: sought where the path comes near itself and by what they look like, and proved by registration.
 
-A loop is believed where the verdict of ``align`` is "aligned" and the map of the place agrees with it; one that lies
-further off than the path can have drifted only where another one tells the same. They are closed by a pose graph
+A loop is believed where the verdict of ``align`` is "aligned", the map of the place agrees with it and the path may have
+drifted so far; one that the path did not expect, only where another one tells the same. What agrees so and lies further
+off than any path drifts are two places that look alike, as the aisles of a warehouse do: by how far these lie apart it
+shows what would be taken for a loop there. They are closed by a pose graph
 (GTSAM), each with the information that the scan has at the place; while one does not fit the closed path, the worst is
 dropped (Baarda's data snooping: a robust kernel would rather believe the path, whose drift is no noise). Lengths are in
 voxels and poses are T_map_scan, as in ``odometry``.
@@ -26,6 +28,7 @@ from fmr_cli.sequence.prepared_scan import PreparedScan
 # Set by hand on simulated rounds; lengths in voxels.
 SPACING = 10.0  # between the keyframes that loops are sought for
 RADIUS, DRIFT = 25.0, 0.02  # how near a place must seem: a distance, and a share of the path since
+MOST_DRIFT = 0.1  # of the path: what looks like a place further off than that is another one
 DETOUR = 4.0  # a loop's path is at least so many times that distance
 NEIGHBOURS = 2  # keyframes on either side that make up the place's map
 AGREE = 2.0  # so near must the place's map put the scan to where registration puts it; and a closed path to its loops
@@ -40,14 +43,27 @@ GAP_SIGMA = 100 * STEP_SIGMA  # where one of them is uncertain
 class Loop:
     """Frame ``later`` seen from frame ``earlier``: T_earlier_later (4, 4).
 
-    information: (6, 6) of a twist (omega, v) on its left. expected: whether the path comes near itself there.
+    information: (6, 6) of a twist (omega, v) on its left. between: length of the path from the one to the other; off:
+    how far the path puts the later one from there. expected: whether the path comes near itself there.
     """
 
     earlier: int
     later: int
     T_earlier_later: np.ndarray
     information: np.ndarray
+    between: float
+    off: float
     expected: bool = True
+
+    @property
+    def possible(self) -> bool:
+        """Whether the path may have drifted so far."""
+        return self.off <= AGREE + (DRIFT if self.expected else MOST_DRIFT) * self.between
+
+    @property
+    def confused(self) -> bool:
+        """Whether no path drifts so far: two places that look alike."""
+        return self.off > AGREE + MOST_DRIFT * self.between
 
 
 def close_loops(
@@ -62,9 +78,10 @@ def close_loops(
     path = path_lengths(poses)
     load = lru_cache(maxsize=4 * NEIGHBOURS + 2)(load)
     near = candidates(poses, keys)
-    loops = proved(near, poses, keys, load, pair, expected=True)
+    seen = proved(near, poses, keys, load, pair, expected=True)
     alike = [pair for pair in lookalikes(path, keys, load, pair) if pair not in near]
-    loops += proved(alike, poses, keys, load, pair, expected=False)
+    seen += proved(alike, poses, keys, load, pair, expected=False)
+    loops = believed(seen)
     loops = [loop for loop in loops if loop.expected or confirmed(loop, loops, poses, path)]
     while loops:
         closed = optimise(poses, sure, loops)
@@ -129,7 +146,7 @@ def proved(
     pairs: list[tuple[int, int]], poses: np.ndarray, keys: list[int], load: Callable[[int], PreparedScan],
     pair: Options, *, expected: bool,
 ) -> list[Loop]:  # fmt: skip
-    """The loops among pairs of places in ``keys``, each (earlier, later), in the order of the later one."""
+    """What registration takes for loops among pairs of places in ``keys``, each (earlier, later), by the later one."""
     loops: list[Loop] = []
     last = -REST - 1
     for earlier, later in pairs:
@@ -138,18 +155,21 @@ def proved(
         loop = verify(poses, keys, earlier, later, load, pair, expected)
         if loop is not None:
             loops.append(loop)
-            last = later
+            last = later if loop.possible else last
     return loops
+
+
+def believed(seen: list[Loop]) -> list[Loop]:
+    """The possible ones, nearer to the path than half the way from a place to the nearest that looks like it."""
+    confusion = min((loop.off for loop in seen if loop.confused), default=np.inf)
+    return [loop for loop in seen if loop.possible and loop.off < confusion / 2]
 
 
 def verify(
     poses: np.ndarray, keys: list[int], earlier: int, later: int, load: Callable[[int], PreparedScan], pair: Options,
     expected: bool,
 ) -> Loop | None:  # fmt: skip
-    """The loop of two keyframes, or None where registration does not say surely that they show one place.
-
-    Where the path comes near itself there, the loop must also lie within what the path may have drifted.
-    """
+    """The loop of two keyframes, or None where registration does not say surely that they show one place."""
     from fmr_cli.registration import align
 
     scan = load(keys[later])
@@ -157,10 +177,8 @@ def verify(
     if found.status != "aligned":
         return None
     T_earlier_map = np.linalg.inv(poses[keys[earlier]])
-    drifted = np.linalg.norm((T_earlier_map @ poses[keys[later]] - found.T_target_source)[:3, 3])
-    between = path_lengths(poses[keys[earlier] : keys[later] + 1])[-1]
-    if expected and drifted > AGREE + DRIFT * between:
-        return None
+    off = float(np.linalg.norm((T_earlier_map @ poses[keys[later]] - found.T_target_source)[:3, 3]))
+    between = float(path_lengths(poses[keys[earlier] : keys[later] + 1])[-1])
     place = LocalMap()
     for key in keys[max(earlier - NEIGHBOURS, 0) : min(earlier + NEIGHBOURS + 1, later)]:
         place.insert(key, load(key), T_earlier_map @ poses[key])
@@ -170,7 +188,7 @@ def verify(
     about = np.eye(6)  # a twist about the origin as one about the points' centre
     about[3:, :3] = np.cross(np.eye(3), fit.seen.centre).T
     information = about.T @ bounded(fit.seen.information, fit.seen.radius, FINE) @ about
-    return Loop(keys[earlier], keys[later], fit.T_map_scan, information, expected)
+    return Loop(keys[earlier], keys[later], fit.T_map_scan, information, between, off, expected)
 
 
 def confirmed(loop: Loop, loops: list[Loop], poses: np.ndarray, path: np.ndarray) -> bool:

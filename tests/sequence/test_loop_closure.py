@@ -8,7 +8,7 @@ from degenerate import block, placed, seen, spinning, wall
 from simulation import drive, make_street, scan
 
 from fmr_cli.sequence import loop_closure
-from fmr_cli.sequence.loop_closure import Loop, close_loops, confirmed, path_lengths
+from fmr_cli.sequence.loop_closure import Loop, believed, close_loops, confirmed, path_lengths
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
 pytest.importorskip("gtsam")
@@ -53,10 +53,26 @@ def test_a_corridor_that_repeats_is_no_loop(monkeypatch):
     assert np.array_equal(closed, poses)
 
 
+def far_loop(earlier, later, T_earlier_later):
+    return Loop(earlier, later, T_earlier_later, np.eye(6), between=3000.0, off=290.0, expected=False)
+
+
+def measured(between, off, *, expected):
+    return Loop(0, 1, np.eye(4), np.eye(6), between, off, expected)
+
+
+def test_where_aisles_look_alike_none_is_taken_for_another():
+    """No path of 110 voxels drifts by 27: what looks alike lies 27 apart here, and would be taken for a loop later."""
+    alike, later = measured(110.0, 27.0, expected=True), measured(680.0, 56.0, expected=False)
+    near, drifted = measured(500.0, 3.0, expected=True), measured(2000.0, 26.0, expected=True)
+    assert believed([later, near, drifted]) == [later, near, drifted]
+    assert believed([alike, later, near, drifted]) == [near]
+
+
 def test_a_loop_far_off_the_path_needs_another_one_that_says_the_same():
     poses = np.array([placed(10.0 * i) for i in range(40)])
-    far = [Loop(0, 30, placed(5.0), np.eye(6), False), Loop(2, 32, placed(5.5), np.eye(6), False)]
-    other = Loop(4, 36, placed(120.0), np.eye(6), False)
+    far = [far_loop(0, 30, placed(5.0)), far_loop(2, 32, placed(5.5))]
+    other = far_loop(4, 36, placed(120.0))
     path = path_lengths(poses)
     assert confirmed(far[0], [*far, other], poses, path)
     assert not confirmed(far[0], [far[0], other], poses, path)
