@@ -144,6 +144,27 @@ def test_the_covariance_is_that_of_the_error() -> None:
     assert 2 < np.median(squared) < 12  # within 1.6 times the true deviations
 
 
+def test_a_range_bias_counts_along_the_view_where_the_eye_is_known() -> None:
+    """A corner seen from afar: a longer range moves it along the view, and nothing in the residuals tells."""
+    rng = np.random.default_rng(3)
+    box = rng.uniform(0, 1, (9000, 3))
+    box[np.arange(9000), rng.integers(0, 3, 9000)] = 0.0
+    eye, sigma = np.array([20.0, 20.0, 20.0]), 0.005
+    source, target = (
+        Surface(box[half] + rng.normal(0, 0.001, (4500, 3)), 0.05) for half in np.split(np.arange(9000), 2)
+    )
+    view = np.concatenate([np.zeros(3), eye / np.linalg.norm(eye)])
+
+    def along(eyes: tuple[np.ndarray | None, ...], noise: float) -> float:
+        found = observability.certainty(source, target, np.eye(4), source.points.mean(0), (noise, noise), eyes)
+        return float(np.sqrt(view @ found.covariance @ view))
+
+    both = 2**0.5 * sigma  # the bias of either scan
+    assert along((eye, eye), sigma) == pytest.approx(both, rel=0.25)
+    assert along((None, None), sigma) < 0.5 * both
+    assert along((eye, eye), 0.0) < 0.1 * both
+
+
 def test_a_turn_is_seen_about_the_scan_however_far_the_map_s_centre_is(room_scans: Scans) -> None:
     source, target = (Surface(s, EDGE) for s in room_scans)
     near = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
