@@ -217,6 +217,7 @@ def passages(rng: np.random.Generator, a: float, b: float, width: float, rough: 
     scene.add(CUBE, [0, 0, 2 * height + 1], [a, b, 1])
     scene.add(CUBE, [0, 0, height], [(a - width) / 2, (b - width) / 2, height + 0.1])
     scene.add(CUBE, [0, 0, height], [(a + width) / 2, (b + width) / 2, height + 0.1])  # seen from within
+    things = []
     for side in range(4):
         turned = Rotation.from_euler("z", 90 * side, degrees=True)
         along, across = (a, b) if side % 2 == 0 else (b, a)
@@ -225,13 +226,19 @@ def passages(rng: np.random.Generator, a: float, b: float, width: float, rough: 
             y = -across / 2 + rng.choice([-1, 1]) * width / 2
             if rough:
                 at, half = [x, y, rng.uniform(0, 2 * height)], rng.uniform(0.2, rough, 3)
-                scene.add(CUBE, turned.apply(at), half, Rotation.random(random_state=rng))
+                things.append((turned.apply(at), half, Rotation.random(random_state=rng), np.linalg.norm(half)))
                 x += rng.uniform(0.1, 0.5)
             else:
                 half = np.array([rng.uniform(0.2, 0.6), rng.uniform(0.03, 0.25), rng.uniform(0.4, 1.2)])
-                scene.add(CUBE, turned.apply([x, y, half[2]]), half, turned)
+                things.append((turned.apply([x, y, half[2]]), half, turned, np.linalg.norm(half[:2])))
                 x += rng.uniform(1.5, 4)
-    return scene, round_corners((a, b), 4, rng, 0.1, 1.0)
+    corners = round_corners((a, b), 4, rng, 0.1, 1.0)
+    way = Way(corners, 1.0)
+    passed = way.poses(np.arange(0, way.length, 0.2))[:, :2, 3]
+    for at, half, turned, size in things:  # at a corner, what stands along one side may stand in the way of the next
+        if np.linalg.norm(passed - at[:2], axis=1).min() > size + 0.2:
+            scene.add(CUBE, at, half, turned)
+    return scene, corners
 
 
 def warehouse(rng: np.random.Generator, a: float, b: float) -> tuple[Scene, np.ndarray]:

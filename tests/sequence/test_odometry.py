@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from degenerate import placed
 from simulation import drive, make_street, scan
 
 from fmr_cli.io import read_cloud, read_poses
-from fmr_cli.sequence import align_sequence
+from fmr_cli.sequence.local_map import Fit
 from fmr_cli.sequence.odometry import Odometry
 from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
-from fmr_cli.synthetic.drives import Drive, Way, passages, spinning
 
 REFERENCE = "reference_poses.txt"
 
@@ -61,22 +63,19 @@ def test_backwards_and_every_third_scan(turning, every):
     assert errors(frames, truth[::every])[0] < 0.004
 
 
-class Corner(Drive):
-    """The third corner of a round of passages."""
-
-    @property
-    def seconds(self):
-        return super().seconds[215:237]
-
-
-@pytest.mark.slow
-def test_at_a_corner_that_fits_itself_in_several_ways_no_leap_is_taken():
-    scene, corners = passages(np.random.default_rng(0), 36, 24, 2.4, 0.0)
-    sensor = spinning(16, -15, 15, 900, 60.0)
-    corner = Corner(scene, Way(corners, 1.2, wobble=1.0), sensor, 5.0, seed=2)
-    poses, truth = align_sequence(list(corner.scans())).poses, corner.truth()
-    found, true = (np.linalg.inv(path[:-1]) @ path[1:] for path in (poses, truth))
-    assert np.abs(found - true)[:, :3, 3].max() < 0.1
+@pytest.mark.parametrize(("overlap", "start"), [(0.4, "prediction"), (0.9, "features")])
+def test_a_leap_that_registration_is_not_sure_of_has_to_fit_as_usual(turning, monkeypatch, overlap, start):
+    scans = turning[0]
+    frame = VoxelFrame(choose_voxel(scans[0]), np.median(scans[0], axis=0))
+    odometry = Odometry(frame)
+    for points in scans[:5]:
+        assert odometry.register(prepare_scan(points, frame)).status == "aligned"
+    elsewhere = placed(300.0)
+    monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), elsewhere))
+    # A door stands before the scanner: nothing fits well, and another place hardly better.
+    fits = {"features": Fit(elsewhere, overlap, 1.0, "features")}
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: fits.get(name, Fit(T, 0.35, 1.0, name)))
+    assert odometry._best_fit(prepare_scan(scans[5], frame), odometry.motion.expect(None, 1.0)).start == start
 
 
 def test_the_unit_and_the_place_do_not_matter(turning, first_four):
