@@ -55,7 +55,7 @@ def further(
                 found = features(seen, time)
                 if coarseness >= COARSE:
                     with time.stage("refine"):
-                        found = [replace(h, T_target_source=refinement.refined(seen, h)) for h in found[:REFINED]]
+                        found = [replace(h, T_target_source=refinement.refined(seen, h)) for h in found]
                 consider(judge, found, time)
             if judge.sure(enough):
                 return judge

@@ -13,11 +13,13 @@ from scipy.spatial.transform import Rotation
 import fmr_cli
 from fmr_cli import PointCloud, align
 from fmr_cli.errors import FmrError, RegistrationError
+from fmr_cli.registration import looks
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import prepare
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration
 from fmr_cli.synthetic import scenes
+from fmr_cli.synthetic.verdict_pairs import fresh_pair
 
 Scans = tuple[np.ndarray, np.ndarray]
 
@@ -380,3 +382,12 @@ def test_the_metrics_are_plain_json(found: Registration) -> None:
     said = json.loads(json.dumps(given.to_dict(), allow_nan=False))
     assert said["inlier_rmse"] is None
     assert said["options"]["init"] == ANY.tolist()
+
+
+@pytest.mark.slow
+def test_scans_far_apart_in_a_street_are_found_on_coarse_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = fresh_pair("street, 30 to 60 %", 9001, 3)
+    source, target = PointCloud(pair.source), PointCloud(pair.target)
+    assert pair.is_right(align(source, target, hints=False).T_target_source)
+    monkeypatch.setattr(looks, "FURTHER", looks.FURTHER[:-1])
+    assert not pair.is_right(align(source, target, hints=False).T_target_source)
