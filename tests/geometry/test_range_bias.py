@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmr_cli.geometry.observability import BIAS, outwards, range_bias
+from fmr_cli.geometry.observability import outwards, range_bias
 from fmr_cli.geometry.point_to_plane import linearise
 
 NOISE = 0.01  # of each residual, own unit
@@ -24,7 +24,8 @@ def added(faces: list[tuple[int, float]], bias: float) -> np.ndarray:
     r, J = linearise(x, x, n, np.zeros(3))
     r = r + rng.normal(0, NOISE, len(r)) + bias * outward
     w = np.ones(len(r))
-    return range_bias(J, np.stack([outward, -outward]), w, r, np.linalg.inv(J @ J.T), NOISE**2, 500.0)
+    sigma = np.full(2, NOISE)
+    return range_bias(J, np.stack([outward, -outward]), w, r, np.linalg.inv(J @ J.T), NOISE**2, sigma, 500.0)
 
 
 CORNER = [(0, 1.0), (1, 1.0), (2, 1.0)]
@@ -36,6 +37,6 @@ def test_a_closed_box_moves_by_no_range_bias() -> None:
 
 
 def test_in_a_corner_a_range_bias_is_a_shift_that_no_residual_tells() -> None:
-    # Each scan's bias, BIAS sigmas, moves a face by the mean of n·u over it, some 0.8; those of two add up by squares.
+    # Each scan's bias, of one sigma, moves a face by the mean of n·u over it, some 0.8; those of two add up by squares.
     shift = np.sqrt(np.diag(added(CORNER, 0.0))[3:])
-    assert np.all((shift > 0.6 * BIAS * NOISE) & (shift < 2.5 * BIAS * NOISE))
+    assert np.all((shift > 0.6 * NOISE) & (shift < 2.5 * NOISE))
