@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Python compiles what it imports, the first time: a small part of what pip would take a minute for.
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e
-# Of pytest, a test process takes about 0.7 GB. One more than there are cores: tests that kill and stop processes wait.
+# Processes of pytest, about 0.7 GB each; one more than there are cores, since tests that kill and stop processes wait.
 WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
 
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal # runs of tests: what a file's tests share is made once

@@ -38,8 +38,9 @@ BARE, IF_BARE = 5, 0.3
 OUTVOTED, ABOUT, FITS, IF_OUTVOTED = np.log(1.5), 0.9, 0.25, 0.3
 # A rival that has ABOUT as much support, weighs NEARLY as much and that hardly anything contradicts (LITTLE: explained
 # over contradicted points, a logarithm): where a scene repeats itself, one of the like may stand first for being seen
-# from the same side in both scans. Of 286 pairs (kinds "repetition" of `python -m benchmarks.verdict`, seed 600) 7 of 8
-# confidences of 0.7 to 0.9 beside such a rival were wrong, and 3 of 7 higher ones: wrong is so many times as likely.
+# from the same side in both scans. Wrong is so many times as likely then: by hand, on 286 pairs (kinds "repetition" of
+# `python -m benchmarks.verdict`, seed 600), where 7 of 8 confidences of 0.7 to 0.9 beside such a rival were wrong.
+# `python -m benchmarks.calibrate` counts them.
 NEARLY, LITTLE, SO_MANY = 0.1, np.log(15), 4.0
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
@@ -127,10 +128,9 @@ def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray
     x: (n, d) their evidence. The first has what the verdict gives it, the others share the rest.
     """
     weigh, first = standing(x, weights)
-    logit = float(products(first[None], weights)[0] @ weights.verdict)
     best = int(weigh.argmax())
-    logit -= np.log(SO_MANY) if rivalled(x, weigh, weights) else 0.0
-    p = float(sigmoid(np.array(logit)))
+    logit = products(first[None], weights) @ weights.verdict
+    p = float(sigmoid(logit - np.log(SO_MANY) * rivalled(x, weigh, weights))[0])
     p = min(p, most(x[best]), IF_OUTVOTED if outvoted(x, weigh, weights) else 1.0)
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
@@ -157,25 +157,27 @@ def most(x: np.ndarray) -> float:
     return min([p for holds, p in bounds if holds], default=1.0)
 
 
-def outvoted(x: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
-    """Whether clearly more matches agree with a rival of the first of poses that is about as likely and fits nearly so.
+def close_rivals(x: np.ndarray, weigh: np.ndarray, weights: Weights, share: float) -> np.ndarray:
+    """Which of distinct poses are about as likely as the first one by themselves, and fit nearly as well: (n,).
 
-    x: (n, d) their evidence; weigh: (n,) what each weighs among them, see ``standing``.
+    x: (n, d) their evidence; weigh: (n,) what each weighs among them, see ``standing``; share: of the first one's
+    weight, that they have at least.
     """
     best, supports = int(weigh.argmax()), support(x, weights)
-    others = (supports >= ABOUT * supports[best]) & (weigh >= FITS * weigh[best])
-    return bool((x[others, VOTES] > x[best, VOTES] + OUTVOTED).any())
+    others = (supports >= ABOUT * supports[best]) & (weigh >= share * weigh[best])
+    others[best] = False
+    return others
+
+
+def outvoted(x: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
+    """Whether clearly more matches agree with a close rival of the first of poses; see ``close_rivals``."""
+    votes = x[close_rivals(x, weigh, weights, FITS), VOTES]
+    return bool((votes > x[weigh.argmax(), VOTES] + OUTVOTED).any())
 
 
 def rivalled(x: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
-    """Whether a rival of the first of poses is about as likely, fits nearly as well and is hardly contradicted.
-
-    x: (n, d) their evidence; weigh: (n,) what each weighs among them, see ``standing``.
-    """
-    best, supports = int(weigh.argmax()), support(x, weights)
-    others = (supports >= ABOUT * supports[best]) & (weigh >= NEARLY * weigh[best]) & (x[:, CONTRADICTION] > LITTLE)
-    others[best] = False
-    return bool(others.any())
+    """Whether hardly anything contradicts a close rival of the first of poses; see ``close_rivals``."""
+    return bool((x[close_rivals(x, weigh, weights, NEARLY), CONTRADICTION] > LITTLE).any())
 
 
 @dataclass

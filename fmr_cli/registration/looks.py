@@ -22,7 +22,8 @@ REFINED = 8  # hypotheses that are refined and judged, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
 FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
-FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000), (2.8, 1000))  # the looks after it, while none is sure
+# The looks after it, while none is sure; the coarsest for LiDAR scans far apart in a street, whose rings lie far apart.
+FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000), (2.8, 1000))
 COARSE = 2.0  # from which a look's poses are too rough to be refined on the voxels that they are judged on
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 

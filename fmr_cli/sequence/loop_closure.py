@@ -2,11 +2,11 @@
 
 A loop is believed where the verdict of ``align`` is "aligned", the map of the place agrees with it and the path may
 have drifted so far; one that the path did not expect, only where another one tells the same. What agrees so and lies
-further off than any path drifts are two places that look alike, as the aisles of a warehouse do: by how far these lie
-apart it shows what would be taken for a loop there. They are closed by a pose graph
-(GTSAM), each with the information that the scan has at the place; while one does not fit the closed path, the worst is
-dropped (Baarda's data snooping: a robust kernel would rather believe the path, whose drift is no noise). Lengths are in
-voxels and poses are T_map_scan, as in ``odometry``.
+further off than any path drifts are two places that look alike, as the aisles of a warehouse do: how far these lie
+apart shows what would be taken for a loop there. Loops are closed by a pose graph (GTSAM), each with the information
+that the scan has at the place; while one does not fit the closed path, the worst is dropped (Baarda's data snooping: a
+robust kernel would rather believe the path, whose drift is no noise). Lengths are in voxels and poses are T_map_scan,
+as in ``odometry``.
 """
 
 from __future__ import annotations

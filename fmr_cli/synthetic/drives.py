@@ -16,6 +16,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.synthetic.scenes import BALL, CUBE, CYLINDER, Scene, camera_rays
 
 PARTS = 24  # of a revolution, each seen from one place: 15 deg, in which a car at 10 m/s and 10 Hz moves 4 cm
+CLEARANCE = 0.2  # m, of what stands in a passage from the scanner's way, beyond its own size
 LOST = 0.02  # share of the rays that give nothing
 
 
@@ -236,7 +237,7 @@ def passages(rng: np.random.Generator, a: float, b: float, width: float, rough: 
     way = Way(corners, 1.0)
     passed = way.poses(np.arange(0, way.length, 0.2))[:, :2, 3]
     for at, half, turned, size in things:  # at a corner, what stands along one side may stand in the way of the next
-        if np.linalg.norm(passed - at[:2], axis=1).min() > size + 0.2:
+        if np.linalg.norm(passed - at[:2], axis=1).min() > size + CLEARANCE:
             scene.add(CUBE, at, half, turned)
     return scene, corners
 
