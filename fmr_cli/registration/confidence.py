@@ -38,9 +38,9 @@ BARE, IF_BARE = 5, 0.3
 OUTVOTED, ABOUT, FITS, IF_OUTVOTED = np.log(1.5), 0.9, 0.25, 0.3
 # A rival that has ABOUT as much support, weighs NEARLY as much and that hardly anything contradicts (LITTLE: explained
 # over contradicted points, a logarithm): where a scene repeats itself, one of the like may stand first for being seen
-# from the same side in both scans. Wrong is so many times as likely then: by hand, on 286 pairs (kinds "repetition" of
-# `python -m benchmarks.verdict`, seed 600), where 7 of 8 confidences of 0.7 to 0.9 beside such a rival were wrong.
-# `python -m benchmarks.calibrate` counts them.
+# from the same side in both scans: 5 of 28 poses that stood first so were right (`python -m benchmarks.calibrate
+# --pairs 100 --seed 41000`). Wrong is SO_MANY times as likely then, by hand, on 286 pairs (kinds "repetition" of
+# `python -m benchmarks.verdict`, seed 600): 7 of 8 confidences of 0.7 to 0.9 beside such a rival were wrong.
 NEARLY, LITTLE, SO_MANY = 0.1, np.log(15), 4.0
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
