@@ -19,7 +19,8 @@ from fmr_cli.feature_metric.layers import Layers
 PATCH_RADIUS = 8.0  # voxel edges
 NEIGHBOURS = 256  # looked up in a patch: about what a surface holds within the radius
 PATCH_POINTS = 64  # of them, encoded
-CHANNELS = 10
+CHANNELS = 15
+FIRST_CHANNELS = 10  # of encoders of version 0.1: all but those that do not depend on the frame's x
 FLAT = 0.01  # patch radii: below it, heights say nothing
 CHUNK = 12  # patches encoded at once: their activations stay in the processor's cache
 
@@ -34,6 +35,9 @@ class LocalEncoder:
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray]) -> LocalEncoder:
         """The encoder of arrays ``point.0.weight``, ... Raises ValueError where they are none."""
+        arrays = with_all_channels(arrays)
+        if any(name.replace("weight", "bias") not in arrays for name in arrays):
+            raise ValueError("layers are missing")
         parts = [
             [(arrays[f"{part}.{i}.weight"], arrays[f"{part}.{i}.bias"])
              for i in range(len(arrays)) if f"{part}.{i}.weight" in arrays]
@@ -86,6 +90,14 @@ class LocalEncoder:
         return np.maximum(x + bias, 0)
 
 
+def with_all_channels(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of an encoder; one of FIRST_CHANNELS is given the others, which say nothing in it."""
+    first = arrays.get("point.0.weight")
+    if first is None or first.ndim != 2 or first.shape[1] != FIRST_CHANNELS:
+        return arrays
+    return arrays | {"point.0.weight": np.pad(first, ((0, 0), (0, CHANNELS - FIRST_CHANNELS)))}
+
+
 def reference_frames(offsets: np.ndarray, valid: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """A frame per patch: offsets (K, n, 3) from the keypoint in patch radii, valid (K, n), normal (K, 3) -> (K, 3, 3).
 
@@ -112,8 +124,9 @@ def describe_patches(
 
     offsets: (K, n, 3) in patch radii, nearest first; valid: (K, n); normal: (K, 3) at the keypoints; neighbours: (K, n)
     rows of normals (M, 3). Channels: the position in the patch's frame, the products of the normal's components there
-    (which have no sign to guess), and the distance. The points taken are evenly spaced in the order of distance, so
-    even over the patch.
+    (which have no sign to guess), and the distance. Then what is the same whichever way x points, since noise and
+    little shape turn x: the distance from the frame's z axis, and the products of the normal's components outward,
+    along and about that axis. The points taken are evenly spaced in the order of distance, so even over the patch.
     """
     frame = np.swapaxes(reference_frames(offsets, valid, normal), 1, 2)
     count = np.maximum(valid.sum(1, keepdims=True), 1)
@@ -126,4 +139,12 @@ def describe_patches(
     np.multiply(n[..., 0], n[..., 2], out=out[..., 7])
     np.multiply(n[..., 1], n[..., 2], out=out[..., 8])
     out[..., 9] = np.sqrt((p * p).sum(-1))
+    out[..., 10] = radius = np.hypot(p[..., 0], p[..., 1])
+    outward = p[..., :2] / np.maximum(radius, 1e-6)[..., None]
+    n_out = (n[..., :2] * outward).sum(-1)
+    n_about = n[..., 1] * outward[..., 0] - n[..., 0] * outward[..., 1]
+    np.multiply(n_out, n_out, out=out[..., 11])
+    np.multiply(n_out, n[..., 2], out=out[..., 12])
+    np.multiply(n_out, n_about, out=out[..., 13])
+    np.multiply(n_about, n[..., 2], out=out[..., 14])
     return out

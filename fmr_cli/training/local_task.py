@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.descriptors.patch_encoder import CHANNELS
-from fmr_cli.errors import ModelError
+from fmr_cli.descriptors.patch_encoder import CHANNELS, PATCH_POINTS, with_all_channels
+from fmr_cli.registration.models import model
 from fmr_cli.training.local_views import Views
 from fmr_cli.training.losses import half_precision
 from fmr_cli.training.recipe import LocalRecipe
@@ -18,6 +19,7 @@ from fmr_cli.training.run_folder import held
 from fmr_cli.training.task import Scores, Task, ramped_cosine
 
 RANK1 = "rank-1"  # column of metrics.csv
+RAMP = 100  # steps over which the rate rises
 EXCLUDED = -1e4  # a logit whose exponential is 0 in bfloat16 and float32 alike
 
 
@@ -28,6 +30,18 @@ class LocalNet(nn.Module):
         super().__init__()
         self.point = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((CHANNELS, *point)))
         self.head = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise((point[-1], *head)))
+
+    @classmethod
+    def of(cls, weights: dict[str, Tensor]) -> LocalNet:
+        """The network of these weights, whatever the widths of its layers."""
+
+        def widths(part: str) -> tuple[int, ...]:
+            names = sorted(name for name in weights if name.startswith(part) and name.endswith("weight"))
+            return tuple(len(weights[name]) for name in names)
+
+        net = cls(widths("point"), widths("head"))
+        net.load_state_dict(weights)
+        return net
 
     def forward(self, patches: Tensor) -> Tensor:
         x = patches
@@ -41,12 +55,15 @@ class LocalNet(nn.Module):
 
 def read_local_start(name: str) -> dict[str, Tensor] | None:
     """The weights to start from: "scratch" is None, "base" the bundled ones, else a file's. Raises ModelError."""
-    from fmr_cli.registration.models import model
+    return None if name == "scratch" else local_start(None if name == "base" else Path(name))
 
-    if name == "scratch":
-        return None
-    found = model(None if name == "base" else name)
-    return {name: torch.from_numpy(array) for name, array in (found.weights.local or model().weights.local).items()}
+
+def local_start(path: Path | None) -> dict[str, Tensor]:
+    """The weights of a file's local encoder, of the bundled one where it has none or is None. Raises ModelError."""
+    found = model(path)
+    found.local  # noqa: B018 - raises ModelError where the weights do not fit
+    arrays = with_all_channels(found.weights.local or model().weights.local)
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
 def info_nce(a: Tensor, b: Tensor, views: Views, temperature: float, apart: float) -> Tensor:
@@ -86,7 +103,6 @@ class LocalTask(Task):
         self, recipe: LocalRecipe, material: list[Views], device: torch.device, start: dict[str, Tensor] | None
     ) -> None:
         self.recipe, self.device, self.clouds = recipe, device, 2 * recipe.batch
-        material = [views.to(device) for views in material]
         self.held_out, self.material = material[: recipe.held_out_pairs], material[recipe.held_out_pairs :]
         patches = sum(len(views.place) for views in self.material)
         self.described = [
@@ -94,33 +110,28 @@ class LocalTask(Task):
             f"{len(self.held_out)} pairs held out"
         ]
         torch.manual_seed(recipe.seed)
-        self.net = LocalNet().to(device)
-        if start is not None:
-            try:
-                self.net.load_state_dict(start)
-            except RuntimeError as error:
-                reason = " ".join(str(error).split())[:200]
-                raise ModelError(f"{recipe.start}: the weights do not fit the local encoder ({reason})") from None
+        self.net = (LocalNet() if start is None else LocalNet.of(start)).to(device)
         self.modules: dict[str, nn.Module] = {"local": self.net}
 
     def losses(self, step: int, steps: int, generator: torch.Generator) -> dict[str, Tensor]:
         """InfoNCE of a batch of pairs."""
         order = torch.randperm(len(self.material), generator=generator, device=self.device)
-        chosen = [self.material[int(i)] for i in order[: self.recipe.batch]]
+        seen = torch.randperm(PATCH_POINTS, generator=generator, device=self.device)[: self.recipe.patch_points].cpu()
+        chosen = [self.material[int(i)].sparser(seen).to(self.device) for i in order[: self.recipe.batch]]
         temperature, apart = self.recipe.temperature, self.recipe.apart
         pairs = zip(described(self.net, chosen), chosen, strict=True)
         return {"info_nce": torch.stack([info_nce(a, b, v, temperature, apart) for (a, b), v in pairs]).mean()}
 
     def rate(self, step: int, steps: int) -> float:
-        return ramped_cosine(step, 0, steps, self.recipe.learning_rate, ramp=1)
+        return ramped_cosine(step, 0, steps, self.recipe.learning_rate, ramp=RAMP)
 
     @torch.no_grad()
     def test(self) -> Scores:
         """How often the nearest descriptor among the other scan's is of the same place, within ``apart``."""
         shares = []
-        for views in self.held_out:
-            nearest = (self.net(views.source) @ self.net(views.target).T).argmax(1)
-            off = (views.place_target[nearest] - views.place).norm(dim=1)
+        for views in (views.to(self.device) for views in self.held_out):
+            nearest = (self.net(views.source[: views.common]) @ self.net(views.target).T).argmax(1)
+            off = (views.place_target[nearest] - views.place[: views.common]).norm(dim=1)
             shares.append(float((off < self.recipe.apart).float().mean()))
         return {"same place": {RANK1: float(np.mean(shares))}}
 

@@ -1,6 +1,7 @@
 """Material of the local patch encoder: patches of two made-up scans that show one place, without a label.
 
-The scenes know where both scanners stood, so every keypoint of one scan has its place in the other for free.
+The scenes know where both scanners stood, so every keypoint of one scan has its place in the other for free. Half of
+the pairs are ordinary, half are hard: little overlap, few points, and bent as real scans are.
 """
 
 from __future__ import annotations
@@ -23,11 +24,17 @@ from fmr_cli.cores import usable_cores
 from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_RADIUS, describe_patches
 from fmr_cli.geometry.sampling import working_scale
 from fmr_cli.geometry.surface import Surface
+from fmr_cli.registration.looks import FURTHER
+from fmr_cli.synthetic.calibration_pairs import BENDS, bent
+from fmr_cli.synthetic.draft import log_uniform
 from fmr_cli.synthetic.pairs import degrade, scan_pair
+from fmr_cli.synthetic.verdict_pairs import FAMILIES, make_pair
 
 LEAST_POINTS = 500  # of a scan: fewer hardly fill a hundred patches
 LEAST_PATCHES = 16  # of a pair: fewer are hardly each other's negatives
-VOXELS = (0.8, 1.25)  # times the working voxel: what `align` picks is that uncertain
+VOXELS = min(FURTHER)[0], max(FURTHER)[0]  # times the working voxel: all that ``align`` looks at
+HARD = 0.5  # of the pairs
+BENT = 0.6  # of the hard pairs
 KEYPOINTS = 1000  # of a scan, among which places are drawn: as many as ``align`` matches
 NEAR = 0.75  # voxel edges between two scans' points of one place: within a voxel's own scatter
 OWN = 1.0  # voxel edges, within which the other scan's own keypoint stands for the place
@@ -42,7 +49,8 @@ CHUNK = 4  # pairs handed to a worker at a time: a pair takes a tenth of a secon
 class Views:
     """Patches of two scans: source (n, PATCH_POINTS, CHANNELS), target (m, ...), and their places in voxels, one frame.
 
-    The first ``common`` of both show one place, row by row; the others have no counterpart, and are negatives alone.
+    Patches are kept as float16, which takes half the memory and is exact to a thousandth of a patch. The first
+    ``common`` of both show one place, row by row; the others have no counterpart, and are negatives alone.
     place (n, 3), place_target (m, 3). alias (n, m), alias_target (m, n): which patch of the other scan shows what looks
     the same as this one's counterpart and is elsewhere.
     """
@@ -64,25 +72,38 @@ class Views:
         """With so many of each patch's points alone, by their numbers."""
         return replace(self, source=self.source[:, points], target=self.target[:, points])
 
-    def half(self) -> Views:
-        """Patches as float16, which takes half the memory and is exact to a thousandth of a patch."""
-        return replace(self, source=self.source.half(), target=self.target.half())
+
+def made_up_scans(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two scans (N, 3), (M, 3) of one made-up scene, and T_target_source."""
+    if rng.random() < HARD:
+        pair = make_pair(str(rng.choice(list(FAMILIES["shy"]))), rng)
+        clouds = [pair.source, pair.target]
+        if rng.random() < BENT:
+            amplitude = log_uniform(rng, *BENDS)
+            clouds = [bent(points, amplitude, rng) for points in clouds]
+        return clouds[0], clouds[1], pair.poses[0]
+    source, target = (degrade(p, rng) if len(p) >= LEAST_POINTS else p for p in scan_pair(rng))
+    return source, target, np.eye(4)
 
 
 def make_views(rng: np.random.Generator, count: int, others: int = 0) -> Views | None:
     """Up to ``count`` corresponding patches of a fresh pair, or None where the two scans hardly share a surface."""
-    pair: list[np.ndarray] = list(scan_pair(rng))
-    if min(map(len, pair)) >= LEAST_POINTS:
-        pair = [degrade(p, rng) for p in pair]
-    if min(map(len, pair)) < LEAST_POINTS:
+    *clouds, T = made_up_scans(rng)
+    if min(map(len, clouds)) < LEAST_POINTS:
         return None
-    scales = [working_scale(p, rng) for p in pair]
-    edge = max(max(v for v, _ in scales), max(s for _, s in scales)) * rng.uniform(*VOXELS)
-    turned = [Rotation.random(random_state=rng) for _ in pair]
-    source, target = (Surface(t.apply(p), edge) for t, p in zip(turned, pair, strict=True))
-    T = np.eye(4)
-    T[:3, :3] = (turned[1] * turned[0].inv()).as_matrix()
-    return between(source, target, T, rng, count, others)
+    scales = [working_scale(points, rng) for points in clouds]
+    edge = max(max(v for v, _ in scales), max(s for _, s in scales)) * log_uniform(rng, *VOXELS)
+    turns = [turn(points, rng) for points in clouds]  # each as its voxel grid may lie on it
+    source, target = (Surface(transform_points(G, points), edge) for G, points in zip(turns, clouds, strict=True))
+    return between(source, target, turns[1] @ T @ np.linalg.inv(turns[0]), rng, count, others)
+
+
+def turn(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A random rotation (4, 4) about the points' mean, which becomes the origin."""
+    G = np.eye(4)
+    G[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    G[:3, 3] = -G[:3, :3] @ points.mean(0)
+    return G
 
 
 def between(
@@ -121,8 +142,9 @@ def between(
         torch.from_numpy(describe_patches(**s.patches(i, PATCH_RADIUS, NEIGHBOURS)))
         for s, i in ((source, index), (target, match))
     )
+    near_a, near_b = aliases(a[:common], b, common), aliases(b[:common], a, common)
     places = [torch.from_numpy(p[i] / edge).float() for p, i in ((moved, index), (target.points, match))]
-    return Views(a, b, places[0], places[1], common, aliases(a[:common], b, common), aliases(b[:common], a, common))
+    return Views(a.half(), b.half(), places[0], places[1], common, near_a, near_b)
 
 
 def aliases(own: Tensor, other: Tensor, common: int) -> Tensor:
@@ -162,6 +184,12 @@ def pair_views(seed: tuple[int, int], count: int, others: int = 0) -> Views:
             return views
 
 
+def pair_arrays(seed: tuple[int, int], count: int, others: int) -> dict[str, Any]:
+    """``pair_views`` in numpy: tensors go between processes as open files, of which a process may have few."""
+    plain = vars(pair_views(seed, count, others))
+    return {name: value if name == "common" else value.numpy() for name, value in plain.items()}
+
+
 def make_material(
     pairs: int,
     patches: int,
@@ -177,7 +205,8 @@ def make_material(
     found: list[Views] = []
     with ProcessPoolExecutor(workers or usable_cores(), mp_context=multiprocessing.get_context("spawn")) as pool:
         seeds = [(seed, number) for number in range(pairs)]
-        for views in pool.map(partial(pair_views, count=patches, others=others), seeds, chunksize=CHUNK):
-            found.append(views)
+        for plain in pool.map(partial(pair_arrays, count=patches, others=others), seeds, chunksize=CHUNK):
+            arrays: dict[str, Any] = {n: torch.from_numpy(v) if n != "common" else v for n, v in plain.items()}
+            found.append(Views(**arrays))
             progress(len(found), pairs)
     return found

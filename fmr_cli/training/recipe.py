@@ -27,7 +27,9 @@ class LocalRecipe:
     kind: str = "local"
     start: str = "base"  # "base", "scratch" or a .safetensors file
     pairs: int = 480  # of scans, made once and drawn from in every step
-    patches: int = 128  # at most, of each scan of a pair
+    patches: int = 128  # of one place, of each scan of a pair, at most
+    others: int = 0  # of each scan's patches that are in it alone
+    patch_points: int = 64  # of a patch's 64, drawn anew in each step
     batch: int = 4  # pairs of a step
     temperature: float = 0.07  # of InfoNCE, as in most work that uses it
     apart: float = 3.0  # voxel edges: nearer places are not each other's negatives

@@ -137,7 +137,7 @@ def local_task(recipe: LocalRecipe, given: Given) -> Task:
     if given.scans or given.pairs is not None:
         raise TrainingError('a recipe of kind "local" learns from made-up scans alone; leave SCANS and --pairs away')
     start = read_local_start(recipe.start)
-    material = make_material(recipe.pairs, recipe.patches, recipe.seed, given.progress)
+    material = make_material(recipe.pairs, recipe.patches, recipe.seed, given.progress, others=recipe.others)
     return LocalTask(recipe, material, given.device, start)
 
 

@@ -125,14 +125,14 @@ class ScanMaterial:
 
         def of_pair(item: tuple[int, Placed]) -> Views | None:
             local = np.random.default_rng((recipe.seed, number, 2, item[0]))
-            return halved(drawn_views(self.overlapping(item[1]), local, recipe.patches, recipe.others))
+            return drawn_views(self.overlapping(item[1]), local, recipe.patches, recipe.others)
 
         def of_single(item: tuple[int, int]) -> Views | None:
             local = np.random.default_rng((recipe.seed, number, 3, item[0]))
             parts = seen_twice(self.store.prepared(item[1]).points, local)
-            return None if parts is None else halved(
-                drawn_views(parts, local, recipe.patches, recipe.others, touch=False)
-            )  # fmt: skip
+            if parts is None:
+                return None
+            return drawn_views(parts, local, recipe.patches, recipe.others, touch=False)
 
         def made(work: Any, items: list[Any], what: str) -> list[Views]:
             found = side_by_side(work, list(enumerate(items)), partial(show, what))
@@ -141,10 +141,9 @@ class ScanMaterial:
         self.views["registered"] = made(of_pair, drawn_pairs, "patches of registered pairs")
         self.views["single"] = made(of_single, singles, "patches of single scans")
         if recipe.made_up and not self.views["made up"]:
-            material = make_material(
+            self.views["made up"] = make_material(
                 recipe.made_up, recipe.patches, recipe.seed, partial(show, "procedural scans"), others=recipe.others
             )
-            self.views["made up"] = [views.half() for views in material]
         if not any(self.views.values()):
             raise TrainingError("the scans are too small to learn from: no part of one holds 500 points")
         if not self.tests:
@@ -163,7 +162,7 @@ class ScanMaterial:
         for name, some in ((SCANS, chosen), (MADE_UP, made_up)):
             look = partial(whole_views, count=TESTED_KEYPOINTS)
             found = side_by_side(look, some, partial(show, "what is held out"))
-            self.tests[name] = [views.half() for views in found if views is not None]
+            self.tests[name] = [views for views in found if views is not None]
 
     def cuts(self, count: int) -> list[tuple[str, Overlapping]]:
         """Parts of held-out scans that stand in for pairs, the bands of overlap in turn; of one scan alone, its own."""
@@ -184,11 +183,6 @@ class ScanMaterial:
         """The pairs with a scan that is held out."""
         placed = {p.ends: p for found in self.rounds for p in found.pairs if not self.trains(p)}
         return list((placed | {p.ends: p for p in self.labelled if not self.trains(p)}).values())
-
-
-def halved(views: Views | None) -> Views | None:
-    """The views as they are kept."""
-    return None if views is None else views.half()
 
 
 def held_out(count: int, share: float, seed: int) -> set[int]:

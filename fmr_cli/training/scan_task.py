@@ -16,13 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from fmr_cli.descriptors.patch_encoder import PATCH_POINTS, LocalEncoder
-from fmr_cli.errors import ModelError
 from fmr_cli.io.weights import Weights, weights_bytes
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.registration.models import model
 from fmr_cli.training import check
 from fmr_cli.training.global_task import SUCCESS, GlobalTask
-from fmr_cli.training.local_task import LocalNet, described, info_nce
+from fmr_cli.training.local_task import LocalNet, described, info_nce, local_start
 from fmr_cli.training.recipe import ScanRecipe
 from fmr_cli.training.run_folder import MODEL, held
 from fmr_cli.training.scan_material import MADE_UP, SCANS, SHARES, ScanMaterial
@@ -53,11 +52,8 @@ class ScanTask(Task):
         self.recipe, self.device, self.start, self.whole = recipe, device, start, whole
         self.clouds, self.clip = 2 * recipe.batch, recipe.whole.clip
         torch.manual_seed(recipe.seed)
-        self.net = LocalNet().to(device)
-        self.first: dict[str, Tensor] = {}
-        if recipe.start != "scratch":
-            self.first = local_start(start)
-            self.net.load_state_dict(self.first)
+        self.first = {} if recipe.start == "scratch" else local_start(start)
+        self.net = (LocalNet.of(self.first) if self.first else LocalNet()).to(device)
         self.modules: dict[str, nn.Module] = {"local": self.net, **(whole.modules if whole else {})}
         self.material = ScanMaterial(recipe, scans, labelled or [])
         self.described = [*self.material.described(), *(whole.described if whole else [])]
@@ -214,15 +210,3 @@ class ScanTask(Task):
 def arrays(tensors: dict[str, Tensor]) -> dict[str, np.ndarray]:
     """Tensors as a model file takes them."""
     return {name: value.numpy() for name, value in held(tensors).items()}
-
-
-def local_start(start: Path | None) -> dict[str, Tensor]:
-    """The local encoder to start from. Raises ModelError."""
-    local = model(start).weights.local or model().weights.local
-    found = {name: torch.from_numpy(array) for name, array in local.items()}
-    try:
-        LocalNet().load_state_dict(found)
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ModelError(f"{start}: the weights do not fit the local encoder ({reason})") from None
-    return found

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.descriptors.patch_encoder import (
     CHANNELS,
+    FIRST_CHANNELS,
     NEIGHBOURS,
     PATCH_POINTS,
     PATCH_RADIUS,
@@ -75,6 +76,39 @@ def test_descriptors_are_those_of_the_network_that_was_trained(patches: Patches,
         wanted = network(torch.from_numpy(described)).numpy()
     np.testing.assert_allclose(descriptor, wanted, rtol=0, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(descriptor, axis=1), 1, rtol=1e-5)
+
+
+def test_the_last_channels_do_not_depend_on_where_x_points(patches: Patches) -> None:
+    described = describe_patches(**patches)
+    about = Rotation.from_rotvec([0, 0, 1.0]).as_matrix().astype(np.float32)
+    p = described[..., :3] @ about.T
+    n = np.array([[3, 6, 7], [6, 4, 8], [7, 8, 5]])  # the channels of a normal's products
+    N = about @ described[..., n] @ about.T
+    outward = p[..., :2] / np.maximum(np.linalg.norm(p[..., :2], axis=-1, keepdims=True), 1e-6)
+    out = np.concatenate([outward, np.zeros_like(p[..., :1])], -1)
+    along = np.stack([-out[..., 1], out[..., 0], out[..., 2]], -1)
+
+    def product(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.einsum("kni,knij,knj->kn", u, N, v)
+
+    up = np.broadcast_to([0, 0, 1.0], p.shape)
+    radius = np.linalg.norm(p[..., :2], axis=-1)
+    wanted = np.stack([radius, product(out, out), product(out, up), product(out, along), product(along, up)], -1)
+    np.testing.assert_allclose(described[..., FIRST_CHANNELS:], wanted, rtol=0, atol=1e-4)
+
+
+def test_an_encoder_of_the_first_version_says_what_it_did(patches: Patches) -> None:
+    rng = np.random.default_rng(0)
+    shapes = {"point.0": (8, FIRST_CHANNELS), "point.1": (8, 8), "head.0": (32, 8)}
+    arrays = {f"{name}.weight": rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    arrays |= {f"{name}.bias": np.zeros(shape[0], np.float32) for name, shape in shapes.items()}
+    described = describe_patches(**patches)
+    x = described[..., :FIRST_CHANNELS]
+    for name in ("point.0", "point.1"):
+        x = np.maximum(x @ arrays[f"{name}.weight"].T, 0)
+    wanted = x.max(1) @ arrays["head.0.weight"].T
+    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    np.testing.assert_allclose(LocalEncoder.of(arrays)(described), wanted, rtol=0, atol=1e-5)
 
 
 def test_a_patch_of_its_keypoint_alone_is_finite() -> None:

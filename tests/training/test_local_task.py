@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save_file
 from safetensors.torch import load_file
 
 from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.errors import ModelError
 from fmr_cli.registration.models import bundled_local_encoder
 from fmr_cli.training.local_task import LocalNet, LocalTask, info_nce, read_local_start
-from fmr_cli.training.local_views import Views, make_material, pair_views
+from fmr_cli.training.local_views import Views, make_material, pair_arrays, pair_views
 from fmr_cli.training.loop import Trainer
 from fmr_cli.training.recipe import LocalRecipe
 
@@ -70,15 +71,16 @@ def test_views_are_the_same_for_any_number_of_workers(material):
 def test_the_file_is_what_registration_reads(tmp_path, material):
     task = LocalTask(TINY, material, CPU, None)
     (tmp_path / "l.safetensors").write_bytes(task.weights())
-    patches = material[0].source
+    patches = material[0].source.float()
     described = LocalEncoder.load(tmp_path / "l.safetensors")(patches.numpy())
     np.testing.assert_allclose(described, task.net(patches).detach().numpy(), atol=1e-5)
 
 
 def test_training_starts_from_the_bundled_weights_and_is_better_than_nothing(material):
+    patches = material[0].source.float()
     bundled = LocalTask(TINY, material, CPU, read_local_start("base"))
     np.testing.assert_allclose(
-        bundled.net(material[0].source).detach().numpy(), bundled_local_encoder()(material[0].source.numpy()), atol=1e-5
+        bundled.net(patches).detach().numpy(), bundled_local_encoder()(patches.numpy()), atol=1e-5
     )
     untrained = LocalTask(TINY, material, CPU, None)
     assert bundled.quality(bundled.test()) > untrained.quality(untrained.test())
@@ -111,7 +113,20 @@ def test_what_is_no_start_is_one_line(tmp_path, name, said):
         read_local_start(str(tmp_path / name))
 
 
-def test_weights_of_another_encoder_are_one_line(material):
+def test_weights_of_another_encoder_are_one_line(tmp_path):
+    save_file({"point.0.weight": np.zeros((3, 3), np.float32)}, tmp_path / "other.safetensors")
     with pytest.raises(ModelError, match="do not fit the local encoder") as error:
-        LocalTask(TINY.changed(start="x.safetensors"), material, CPU, {"point.0.weight": torch.zeros(3, 3)})
+        read_local_start(str(tmp_path / "other.safetensors"))
     assert "\n" not in str(error.value)
+
+
+def test_a_network_goes_on_from_layers_of_any_width(material):
+    wide = LocalNet(point=(8, 24), head=(16, 32))
+    again = LocalNet.of(wide.state_dict())
+    patches = material[0].source.float()
+    assert torch.equal(again(patches), wide(patches))
+
+
+def test_a_thousand_pairs_do_not_come_as_open_files():
+    plain = pair_arrays((5, 0), 32, 0)
+    assert not any(isinstance(value, torch.Tensor) for value in plain.values())
