@@ -30,7 +30,7 @@ CHUNK = 2  # pairs handed to a worker at a time: a pair takes a second, a hand-o
 
 @dataclass(frozen=True)
 class Judged:
-    """What one look at a pair found. x: (n, 10), ``Evidence.vector`` of each pose; right: (n,) bool.
+    """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool.
 
     kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
     """

@@ -48,11 +48,11 @@ RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be 
 MARGIN = (-3.0, 6.0)  # of the margins over rivals: beyond, they say no more; the upper one also where there is no rival
 DEVIATIONS = 3.0  # of what the fit has seen: beyond, products of evidence would run away
 # From where on a kind of evidence is worth a word; they explain a verdict and do not make it.
-CONTRADICTED, STRETCHED, ROUGH, SMALL, FEW, PLAIN = 0.1, 0.005, 1.8, 0.2, 12, 20
-QUALITY = slice(2, 5)  # of ``Evidence.vector``: what ``Evidence.quality`` gives
-# Of ``Evidence.vector``: matches and explained over contradicted, logarithms; the stretch, in negative hundredths;
-# ``detail_log``.
-VOTES, CONTRADICTION, STRETCH, DETAIL = 1, 4, 7, 9
+CONTRADICTED, LACKING, STRETCHED, ROUGH, SMALL, FEW, PLAIN = 0.1, 0.02, 0.005, 1.8, 0.2, 12, 20
+QUALITY = slice(2, 6)  # of ``Evidence.vector``: what ``Evidence.quality`` gives
+# Of ``Evidence.vector``: matches, explained over contradicted and over missing points, logarithms; the stretch, in
+# negative hundredths; ``detail_log``.
+VOTES, CONTRADICTION, MISSING, STRETCH, DETAIL = 1, 4, 5, 8, 10
 TURNED = 5.0  # degrees: rivals turned by less are told by their shift
 
 
@@ -73,9 +73,10 @@ class Evidence(Agreement):
         return self.explained - self.contradicted + self.votes
 
     def quality(self) -> np.ndarray:
-        """How well the surfaces fit where they meet, more is better: (3,)."""
+        """How well the surfaces fit where they meet, more is better: (4,)."""
         close, along = min(1 / self.offset, AS_GOOD), min(1 / self.turn, AS_GOOD)
-        return np.log(np.clip([close, along, (self.explained + 10) / (self.contradicted + 10)], 1e-3, 1e3))
+        against, missing = ((self.explained + 10) / (n + 10) for n in (self.contradicted, self.missing))
+        return np.log(np.clip([close, along, against, missing], 1e-3, 1e3))
 
     def vector(self) -> np.ndarray:
         """What the logistic model sees, after a 1 for the intercept: of each kind of evidence, more is better."""
@@ -278,6 +279,8 @@ def doubts(pair: Pair, best: Candidate, rivals: Sequence[Candidate]) -> list[str
     against = e.contradicted / max(e.explained + e.contradicted, 1)
     if against > CONTRADICTED:
         said.append(f"{against:.0%} of what both scans saw contradicts the pose")
+    elif e.missing > LACKING * e.explained:
+        said.append(f"{e.missing} points that lie together are in one scan alone")
     if e.stretch > STRETCHED:
         said.append(f"fits better with the source scaled by {e.stretch:.1%}: is one of the two in another scale?")
     if e.offset > ROUGH:

@@ -24,6 +24,8 @@ ADVICE = (
      "can be given with --init."),
     ("contradicts the pose", "Look at the section for surfaces that cross, or that float before one another. Things "
      "that moved between the scans also do this."),
+    ("in one scan alone", "Look there: if it was moved or taken away between the scans, the pose may be right; if it "
+     "stands elsewhere in the other scan, it is wrong."),
     ("scaled by", "If the two were not measured in one scale, register them with --scale."),
     ("as far apart as", "The surfaces do not meet as closely as the scans are smooth: one may be bent, drifted or "
      "noisy."),
@@ -37,6 +39,7 @@ ADVICE = (
 EVIDENCE = {
     "explained": ("points explained", "lie on the other surface and face along with it"),
     "contradicted": ("points that contradict", "float off a surface that the other scan saw there"),
+    "missing": ("points of missing things", "of the latter, those that lie together: a thing that one scan lacks"),
     "overlap": ("overlap", "share of the smaller scan near the other one"),
     "explained_share": ("overlap that is explained", "the same, counting explained points only"),
     "inlier_rmse": ("RMSE", "to the surface of the other scan"),

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration import confidence
-from fmr_cli.registration.agreement import agreement
+from fmr_cli.registration.agreement import agreement, amid_their_like
 from fmr_cli.registration.pipeline import align
 from fmr_cli.registration.verdict_weights import bundled_weights
 
@@ -30,8 +30,8 @@ def pose(angle: float, shift: float) -> np.ndarray:
 def evidence(**given: float) -> confidence.Evidence:
     """What a good pose of two rooms has, but for what is given."""
     usual = {
-        "explained": 8000, "contradicted": 100, "overlap": 0.9, "explained_share": 0.8, "inlier_rmse": 0.01,
-        "offset": 0.7, "turn": 1.0, "detail": 2000, "stretch": 0.0, "votes": 200, "repeats": 0.15,
+        "explained": 8000, "contradicted": 100, "missing": 0, "overlap": 0.9, "explained_share": 0.8,
+        "inlier_rmse": 0.01, "offset": 0.7, "turn": 1.0, "detail": 2000, "stretch": 0.0, "votes": 200, "repeats": 0.15,
     }  # fmt: skip
     return confidence.Evidence(**(usual | given))  # type: ignore[arg-type]
 
@@ -114,6 +114,16 @@ def test_a_source_of_another_scale_is_stretched() -> None:
     grown = agreement(Surface(points * 1.04, 0.05), Surface(points, 0.05), np.eye(4))
     assert here.stretch < 0.002
     assert grown.stretch > 0.01
+
+
+def test_a_missing_thing_lies_together_and_edges_here_and_there() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.array([[x, y, 0.0] for x in range(60) for y in range(60)]) + rng.normal(0, 0.1, (3600, 3))
+    door = (np.abs(wall[:, 0] - 30) < 5) & (np.abs(wall[:, 1] - 20) < 8)
+    scattered = rng.permutation(door)
+    assert amid_their_like(wall, door, 3.0) > 0.7 * door.sum()
+    assert amid_their_like(wall, scattered, 3.0) < 0.02 * door.sum()
+    assert amid_their_like(wall, door & (np.arange(len(wall)) < 2), 3.0) == 0
 
 
 def test_poses_that_fit_as_well_are_not_sure() -> None:
