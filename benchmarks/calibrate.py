@@ -24,11 +24,12 @@ from fmr_cli.registration.confidence import (
     BARE,
     CONTRADICTION,
     DETAIL,
+    LACKING_MUCH,
+    MISSING,
     OTHER_SCALE,
     STRETCH,
     detail_log,
     outvoted,
-    rivalled,
     standing,
 )
 from fmr_cli.registration.verdict_weights import Weights
@@ -44,13 +45,12 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     poses = np.concatenate([j.x[j.right] for j in evidence])
     stretched = -poses[:, STRETCH] > 100 * OTHER_SCALE
     said = [f"fits better by another scale: {stretched.sum()} of {len(poses)} right poses"]
-    first_and_rivals = [(j.x, w, weights) for j, w in zip(evidence, weigh, strict=True)]
-    votes, alike = (np.array([doubt(*each) for each in first_and_rivals]) for doubt in (outvoted, rivalled))
+    votes = np.array([outvoted(j.x, w, weights) for j, w in zip(evidence, weigh, strict=True)])
     for name, holds in (
         ("more contradicted than explained", seen[:, CONTRADICTION] < 0),
+        ("a third missing", seen[:, MISSING] < LACKING_MUCH),
         ("hardly more than three planes", seen[:, DETAIL] < detail_log(BARE)),
         ("a rival has more matches", votes),
-        ("hardly anything contradicts a rival", alike),
     ):
         said.append(f"{name}: {good[holds].sum()} of {holds.sum()} poses that stood first were right")
     return said
