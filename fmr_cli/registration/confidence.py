@@ -156,10 +156,10 @@ def most(x: np.ndarray) -> float:
 
 
 def outvoted(x: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
-    """Whether clearly more matches agree with a rival of the first of poses that is about as likely by itself and fits
-    nearly as well.
+    """Whether clearly more matches agree with a close rival of the first of poses.
 
-    x: (n, d) the evidence of distinct poses; weigh: (n,) what each weighs among them, see ``standing``.
+    Close is what is about as likely by itself and fits nearly as well. x: (n, d) the evidence of distinct poses; weigh:
+    (n,) what each weighs among them, see ``standing``.
     """
     best, supports = int(weigh.argmax()), support(x, weights)
     others = (supports >= ABOUT * supports[best]) & (weigh >= FITS * weigh[best])
