@@ -27,6 +27,8 @@ from fmr_cli.registration.confidence import (
     LACKING_MUCH,
     MISSING,
     OTHER_SCALE,
+    SCANT,
+    SHARE,
     STRETCH,
     detail_log,
     outvoted,
@@ -49,6 +51,7 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     for name, holds in (
         ("more contradicted than explained", seen[:, CONTRADICTION] < 0),
         ("a third missing", seen[:, MISSING] < LACKING_MUCH),
+        ("hardly anything explained", seen[:, SHARE] < np.log(SCANT)),
         ("hardly more than three planes", seen[:, DETAIL] < detail_log(BARE)),
         ("a rival has more matches", votes),
     ):

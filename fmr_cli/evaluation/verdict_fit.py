@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fmr_cli.evaluation.verdict_evidence import Judged
-from fmr_cli.registration.confidence import QUALITY, confidences, products, sigmoid, standing
+from fmr_cli.registration.confidence import MISSING, QUALITY, confidences, products, sigmoid, standing
 from fmr_cli.registration.verdict_weights import Weights
 
 RIDGE = 2e-3  # on the standardised weights of support and fit: next to nothing where the evidence decides
@@ -35,7 +35,11 @@ def fit(evidence: Sequence[Judged]) -> Weights:
 
 
 def fit_support(evidence: Sequence[Judged]) -> tuple[np.ndarray, np.ndarray]:
-    """(d,) and (q,): support s and fit f, under which pose i is right with s_i times its share of all s_j exp(f_j)."""
+    """(d,) and (q,): support s and fit f, under which pose i is right with s_i times its share of all s_j exp(f_j).
+
+    What is missing has no part in the support: it tells a pose from its like. By itself it says most in these scans,
+    but nothing where points are too sparse to lie together, as a LiDAR's far off; contradiction holds there too.
+    """
     x = np.concatenate([j.x for j in evidence])
     right = np.concatenate([j.right for j in evidence])
     pair = np.repeat(np.arange(len(evidence)), [len(j.x) for j in evidence])
@@ -53,7 +57,8 @@ def fit_support(evidence: Sequence[Judged]) -> tuple[np.ndarray, np.ndarray]:
         return float(-np.log(np.maximum(np.where(none, 1 - each, hit), TINY)).mean() + RIDGE * (w[1:] ** 2).mean())
 
     free = kinds - 1 + QUALITY.stop - QUALITY.start
-    bounds = [(None, None)] + [(0, None)] * free
+    bounds: list[tuple[float | None, float | None]] = [(None, None)] + [(0, None)] * free
+    bounds[MISSING] = (0, 0)
     found = [minimize(loss, np.append(0.0, np.full(free, s)), method="L-BFGS-B", bounds=bounds) for s in STARTS]
     best = min(found, key=lambda m: m.fun).x
     return best[:kinds] / spread, best[kinds:] / spread[QUALITY]

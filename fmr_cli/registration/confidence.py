@@ -31,12 +31,14 @@ AS_GOOD = 1.5  # times as close as a surface's own neighbours: beyond, points ar
 # ones too (`python -m benchmarks.calibrate` counts them). Such pairs are too few for the weights to say so themselves.
 OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: 1 of 2156 right poses had that
 DENIED = 0.1  # more contradicted than explained: none of 57 poses that stood first was right
-# More than a third as many points missing as explained (1 : e): 17 of 218 were right. Furniture that was moved,
+# More than a third as many points missing as explained (1 : e): 17 of 219 were right. Furniture that was moved,
 # another scale, another place of the like.
 LACKING_MUCH, IF_LACKING = 1.0, 0.3
-# Fewer points of detail than that, hardly more than a corner, which fits any other: 21 of 144 were right.
+# Less than a tenth of the smaller scan explained: 11 of 36 were right, and streets turned end to end fit so.
+SCANT, IF_SCANT = 0.1, 0.5
+# Fewer points of detail than that, hardly more than a corner, which fits any other: 21 of 140 were right.
 BARE, IF_BARE = 5, 0.3
-# A rival that has ABOUT as much support, weighs FITS as much and has half as many matches again: 26 of 174 poses that
+# A rival that has ABOUT as much support, weighs FITS as much and has half as many matches again: 24 of 168 poses that
 # stood first were right. They fit a little better for meeting less of the other scan: a facade beyond its only door.
 OUTVOTED, ABOUT, FITS, IF_OUTVOTED = np.log(1.5), 0.9, 0.25, 0.3
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
@@ -47,9 +49,9 @@ DEVIATIONS = 3.0  # of what the fit has seen: beyond, products of evidence would
 # From where on a kind of evidence is worth a word; they explain a verdict and do not make it.
 CONTRADICTED, LACKING, STRETCHED, ROUGH, SMALL, FEW, PLAIN = 0.1, 0.02, 0.005, 1.8, 0.2, 12, 20
 QUALITY = slice(2, 6)  # of ``Evidence.vector``: what ``Evidence.quality`` gives
-# Of ``Evidence.vector``: matches, explained over contradicted and over missing points, logarithms; the stretch, in
-# negative hundredths; ``detail_log``.
-VOTES, CONTRADICTION, MISSING, STRETCH, DETAIL = 1, 4, 5, 8, 10
+# Of ``Evidence.vector``: matches, explained over contradicted and over missing points, explained share, logarithms; the
+# stretch, in negative hundredths; ``detail_log``.
+VOTES, CONTRADICTION, MISSING, SHARE, STRETCH, DETAIL = 1, 4, 5, 6, 8, 10
 TURNED = 5.0  # degrees: rivals turned by less are told by their shift
 
 
@@ -150,6 +152,7 @@ def most(x: np.ndarray) -> float:
         (-x[STRETCH] > 100 * OTHER_SCALE, IN_OTHER_SCALE),
         (x[CONTRADICTION] < 0, DENIED),
         (x[MISSING] < LACKING_MUCH, IF_LACKING),
+        (x[SHARE] < np.log(SCANT), IF_SCANT),
         (x[DETAIL] < detail_log(BARE), IF_BARE),
     ]
     return min([p for holds, p in bounds if holds], default=1.0)
