@@ -8,7 +8,7 @@ import pytest
 from fmr_cli.evaluation.verdict import calibration_error
 from fmr_cli.evaluation.verdict_evidence import Judged, pair_evidence
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
-from fmr_cli.registration.confidence import DETAIL, STRETCH
+from fmr_cli.registration.confidence import DETAIL, MISSING, QUALITY, SHARE, STRETCH
 from fmr_cli.report.calibration import calibration_table, plot_calibration
 from fmr_cli.synthetic.calibration_pairs import DRAWN
 
@@ -19,9 +19,10 @@ def drawn() -> list[Judged]:
     rng = np.random.default_rng(0)
     looks = []
     for number in range(1500):
-        x = np.column_stack([np.ones(3), rng.normal(size=(3, 9))])
-        x[0, 2:5] += 4
-        x[:, [STRETCH, DETAIL]] = np.abs(x[:, [STRETCH, DETAIL]])  # nothing that bounds a confidence by itself
+        x = np.column_stack([np.ones(3), rng.normal(size=(3, 10))])
+        x[0, QUALITY] += 4
+        bounding = [SHARE, STRETCH, DETAIL]
+        x[:, bounding] = np.abs(x[:, bounding])  # nothing that bounds a confidence by itself
         right = np.zeros(3, bool)
         right[0] = rng.random() < 1 / (1 + np.exp(-2 * x[0, 1]))
         looks.append(Judged(x, right, "drawn", True, number))
@@ -37,8 +38,16 @@ def test_confidence_is_the_share_that_is_right(drawn):
 
 
 def test_no_kind_counts_against_its_own_sense(drawn):
-    against = [Judged(j.x * [1, -1, *[1] * 8], j.right, j.kind, j.unique, j.number) for j in drawn]
+    against = [Judged(j.x * [1, -1, *[1] * 9], j.right, j.kind, j.unique, j.number) for j in drawn]
     assert fit(against).support[1] == 0
+
+
+def test_what_is_missing_tells_among_rivals_alone(drawn):
+    told = [Judged(np.where(np.arange(11) == MISSING, 3.0 * j.right[:, None], j.x), j.right, j.kind, j.unique, j.number)
+            for j in drawn]  # fmt: skip
+    weights = fit(told)
+    assert weights.support[MISSING] == 0
+    assert weights.fit[MISSING - QUALITY.start] > 0
 
 
 def test_the_table_counts_every_pair_and_its_right_ones():

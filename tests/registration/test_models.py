@@ -86,8 +86,8 @@ def test_a_calibration_of_another_version_s_evidence_gives_way_to_the_bundled_on
     from fmr_cli.registration.verdict_weights import bundled_weights, usable
 
     given = {name: values.tolist() for name, values in vars(bundled_weights()).items()}
-    own = usable(given | {"fit": [1.0, 2.0, 3.0], "made by": "hand"})
-    assert own.fit.tolist() == [1, 2, 3]
+    own = usable(given | {"fit": [1.0, 2.0, 3.0, 4.0], "made by": "hand"})
+    assert own.fit.tolist() == [1, 2, 3, 4]
     lacking = {name: values for name, values in given.items() if name != "mean"}
     for other in (None, {}, lacking, given | {"fit": [1.0, 2.0]}):
         assert usable(other) is bundled_weights()
