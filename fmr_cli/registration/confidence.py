@@ -38,9 +38,6 @@ LACKING_MUCH, IF_LACKING = 1.0, 0.3
 SCANT, IF_SCANT = 0.1, 0.5
 # Fewer points of detail than that, hardly more than a corner, which fits any other: 21 of 140 were right.
 BARE, IF_BARE = 5, 0.3
-# A rival that has ABOUT as much support, weighs FITS as much and has half as many matches again: 24 of 168 poses that
-# stood first were right. They fit a little better for meeting less of the other scan: a facade beyond its only door.
-OUTVOTED, ABOUT, FITS, IF_OUTVOTED = np.log(1.5), 0.9, 0.25, 0.3
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
 RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be right
@@ -130,7 +127,7 @@ def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray
     weigh, first = standing(x, weights)
     best = int(weigh.argmax())
     p = float(sigmoid(products(first[None], weights) @ weights.verdict)[0])
-    p = min(p, most(x[best]), IF_OUTVOTED if outvoted(x, weigh, weights) else 1.0)
+    p = min(p, most(x[best]))
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
     shares[best] = p
@@ -156,18 +153,6 @@ def most(x: np.ndarray) -> float:
         (x[DETAIL] < detail_log(BARE), IF_BARE),
     ]
     return min([p for holds, p in bounds if holds], default=1.0)
-
-
-def outvoted(x: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
-    """Whether clearly more matches agree with a close rival of the first of poses.
-
-    Close is what is about as likely by itself and fits nearly as well. x: (n, d) the evidence of distinct poses; weigh:
-    (n,) what each weighs among them, see ``standing``.
-    """
-    best, supports = int(weigh.argmax()), support(x, weights)
-    others = (supports >= ABOUT * supports[best]) & (weigh >= FITS * weigh[best])
-    others[best] = False
-    return bool((x[others, VOTES] > x[best, VOTES] + OUTVOTED).any())
 
 
 @dataclass
