@@ -31,6 +31,7 @@ from fmr_cli.registration.confidence import (
     SHARE,
     STRETCH,
     detail_log,
+    rivalled,
     standing,
 )
 from fmr_cli.registration.verdict_weights import Weights
@@ -39,17 +40,20 @@ from fmr_cli.report.calibration import calibration_table, plot_calibration
 
 def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     """How often right poses have what bounds the confidence, whatever the weights say (``confidence.confidences``)."""
-    first = [int(standing(j.x, weights)[0].argmax()) for j in evidence]
+    weigh = [standing(j.x, weights)[0] for j in evidence]
+    first = [int(w.argmax()) for w in weigh]
     x, right = zip(*((j.x[i], j.right[i]) for j, i in zip(evidence, first, strict=True)), strict=True)
     seen, good = np.array(x), np.array(right)
     poses = np.concatenate([j.x[j.right] for j in evidence])
     stretched = -poses[:, STRETCH] > 100 * OTHER_SCALE
     said = [f"fits better by another scale: {stretched.sum()} of {len(poses)} right poses"]
+    alike = np.array([rivalled(j.x, w, weights) for j, w in zip(evidence, weigh, strict=True)])
     for name, holds in (
         ("more contradicted than explained", seen[:, CONTRADICTION] < 0),
         ("a third missing", seen[:, MISSING] < LACKING_MUCH),
         ("hardly anything explained", seen[:, SHARE] < np.log(SCANT)),
         ("hardly more than three planes", seen[:, DETAIL] < detail_log(BARE)),
+        ("hardly more is missing at a close rival", alike),
     ):
         said.append(f"{name}: {good[holds].sum()} of {holds.sum()} poses that stood first were right")
     return said

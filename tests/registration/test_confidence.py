@@ -48,6 +48,10 @@ def test_a_rival_that_fits_nearly_as_well_is_doubt_unless_something_is_missing_t
     assert said(first)[0] > confidence.ALIGNED
     assert said(first, beside)[0] < said(first, lacking)[0]
     assert said(first, lacking)[0] > confidence.ALIGNED
+    weights = bundled_weights()
+    for rival, doubted in ((beside, True), (lacking, False)):
+        x = np.array([e.vector() for e in (first, rival)])
+        assert confidence.rivalled(x, confidence.standing(x, weights)[0], weights) == doubted
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
