@@ -36,11 +36,9 @@ class LocalEncoder:
     def of(cls, arrays: dict[str, np.ndarray]) -> LocalEncoder:
         """The encoder of arrays ``point.0.weight``, ... Raises ValueError where they are none."""
         arrays = with_all_channels(arrays)
-        if any(name.replace("weight", "bias") not in arrays for name in arrays):
-            raise ValueError("layers are missing")
         parts = [
             [(arrays[f"{part}.{i}.weight"], arrays[f"{part}.{i}.bias"])
-             for i in range(len(arrays)) if f"{part}.{i}.weight" in arrays]
+             for i in range(len(arrays)) if {f"{part}.{i}.weight", f"{part}.{i}.bias"} <= arrays.keys()]
             for part in ("point", "head")
         ]  # fmt: skip
         width = CHANNELS
@@ -58,6 +56,15 @@ class LocalEncoder:
         from safetensors.numpy import load_file
 
         return cls.of(load_file(path))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What ``of`` takes."""
+        return {
+            f"{part}.{i}.{kind}": array
+            for part, layers in (("point", self.point), ("head", self.head))
+            for i, layer in enumerate(layers)
+            for kind, array in zip(("weight", "bias"), layer, strict=True)
+        }
 
     @cached_property
     def key(self) -> str:

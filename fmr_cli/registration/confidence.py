@@ -41,7 +41,7 @@ BARE, IF_BARE = 5, 0.3
 # A rival that has ABOUT as much support and weighs NEARLY as much, where hardly more is missing (LACKING: e times, by
 # the logarithm): one of the like may stand first for being seen from the same side in both scans, as bays of a rack.
 # Wrong is SO_MANY times as likely then, by hand: on 256 pairs, most of things that repeat, 15 aligned ones were wrong
-# without it, 12 with it, and 113 of 115 right ones stayed; on the 1,400, 22 and 15 of 690.
+# without it, 12 with it, and 113 of 115 right ones stayed; on the 1,400, 22 of 690 and 15 of 672.
 ABOUT, NEARLY, LACKING, SO_MANY = 0.9, 0.1, 1.0, 4.0
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone

@@ -36,6 +36,11 @@ def calibration_pair(seed: int, number: int) -> VerdictPair:
     pair = make_pair(DRAWN[number % len(DRAWN)], rng)
     if pair.kind in UNBENT or rng.random() < UNTOUCHED:
         return pair
+    return bent_pair(pair, rng)
+
+
+def bent_pair(pair: VerdictPair, rng: np.random.Generator) -> VerdictPair:
+    """The pair with both clouds bent, each by waves of its own, as strongly as real scans are."""
     amplitude = log_uniform(rng, *BENDS)
     source, target = (bent(points, amplitude, rng) for points in (pair.source, pair.target))
     return replace(pair, source=source, target=target)

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.descriptors.patch_encoder import CHANNELS, PATCH_POINTS, with_all_channels
+from fmr_cli.descriptors.patch_encoder import CHANNELS
 from fmr_cli.registration.models import model
-from fmr_cli.training.local_views import Views
+from fmr_cli.training.local_views import Views, some_points
 from fmr_cli.training.losses import half_precision
 from fmr_cli.training.recipe import LocalRecipe
 from fmr_cli.training.run_folder import held
@@ -60,10 +60,7 @@ def read_local_start(name: str) -> dict[str, Tensor] | None:
 
 def local_start(path: Path | None) -> dict[str, Tensor]:
     """The weights of a file's local encoder, of the bundled one where it has none or is None. Raises ModelError."""
-    found = model(path)
-    found.local  # noqa: B018 - raises ModelError where the weights do not fit
-    arrays = with_all_channels(found.weights.local or model().weights.local)
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return {name: torch.from_numpy(array) for name, array in model(path).local.arrays().items()}
 
 
 def info_nce(a: Tensor, b: Tensor, views: Views, temperature: float, apart: float) -> Tensor:
@@ -116,7 +113,7 @@ class LocalTask(Task):
     def losses(self, step: int, steps: int, generator: torch.Generator) -> dict[str, Tensor]:
         """InfoNCE of a batch of pairs."""
         order = torch.randperm(len(self.material), generator=generator, device=self.device)
-        seen = torch.randperm(PATCH_POINTS, generator=generator, device=self.device)[: self.recipe.patch_points].cpu()
+        seen = some_points(self.recipe.patch_points, generator)
         chosen = [self.material[int(i)].sparser(seen).to(self.device) for i in order[: self.recipe.batch]]
         temperature, apart = self.recipe.temperature, self.recipe.apart
         pairs = zip(described(self.net, chosen), chosen, strict=True)

@@ -21,11 +21,11 @@ from torch import Tensor
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.cores import usable_cores
-from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_RADIUS, describe_patches
+from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_POINTS, PATCH_RADIUS, describe_patches
 from fmr_cli.geometry.sampling import working_scale
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.looks import FURTHER
-from fmr_cli.synthetic.calibration_pairs import BENDS, bent
+from fmr_cli.synthetic.calibration_pairs import bent_pair
 from fmr_cli.synthetic.draft import log_uniform
 from fmr_cli.synthetic.pairs import degrade, scan_pair
 from fmr_cli.synthetic.verdict_pairs import FAMILIES, make_pair
@@ -73,15 +73,18 @@ class Views:
         return replace(self, source=self.source[:, points], target=self.target[:, points])
 
 
+def some_points(count: int, generator: torch.Generator) -> Tensor:
+    """The numbers of ``count`` of a patch's points, drawn at random, for ``Views.sparser``."""
+    return torch.randperm(PATCH_POINTS, generator=generator, device=generator.device)[:count].cpu()
+
+
 def made_up_scans(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Two scans (N, 3), (M, 3) of one made-up scene, and T_target_source."""
     if rng.random() < HARD:
         pair = make_pair(str(rng.choice(list(FAMILIES["shy"]))), rng)
-        clouds = [pair.source, pair.target]
         if rng.random() < BENT:
-            amplitude = log_uniform(rng, *BENDS)
-            clouds = [bent(points, amplitude, rng) for points in clouds]
-        return clouds[0], clouds[1], pair.poses[0]
+            pair = bent_pair(pair, rng)
+        return pair.source, pair.target, pair.poses[0]
     source, target = (degrade(p, rng) if len(p) >= LEAST_POINTS else p for p in scan_pair(rng))
     return source, target, np.eye(4)
 

@@ -43,7 +43,7 @@ class LocalRecipe:
         wrong = [
             f"{name} = {value}" for name, value in asdict(self).items() if isinstance(value, int | float) and value < 0
         ]
-        for name in ("pairs", "patches", "batch", "temperature", "steps", "epoch_steps"):
+        for name in ("pairs", "patches", "patch_points", "batch", "temperature", "steps", "epoch_steps"):
             if not getattr(self, name) >= (1 if name != "temperature" else 1e-6):
                 wrong.append(f"{name} = {getattr(self, name)}")
         if wrong:

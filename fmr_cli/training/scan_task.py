@@ -15,13 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fmr_cli.descriptors.patch_encoder import PATCH_POINTS, LocalEncoder
+from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.io.weights import Weights, weights_bytes
 from fmr_cli.multiway.scans import Scan
 from fmr_cli.registration.models import model
 from fmr_cli.training import check
 from fmr_cli.training.global_task import SUCCESS, GlobalTask
 from fmr_cli.training.local_task import LocalNet, described, info_nce, local_start
+from fmr_cli.training.local_views import some_points
 from fmr_cli.training.recipe import ScanRecipe
 from fmr_cli.training.run_folder import MODEL, held
 from fmr_cli.training.scan_material import MADE_UP, SCANS, SHARES, ScanMaterial
@@ -101,8 +102,8 @@ class ScanTask(Task):
         for kind in kinds.tolist():
             views = list(there.values())[kind]
             which = torch.randint(len(views), (1,), generator=generator, device=self.device)
-            seen = torch.randperm(PATCH_POINTS, generator=generator, device=self.device)[: recipe.patch_points]
-            chosen.append(views[int(which)].sparser(seen.cpu()).to(self.device))
+            seen = some_points(recipe.patch_points, generator)
+            chosen.append(views[int(which)].sparser(seen).to(self.device))
         pairs = zip(described(self.net, chosen), chosen, strict=True)
         each = [info_nce(a, b, v, recipe.temperature, recipe.apart) for (a, b), v in pairs]
         return {"info_nce": torch.stack(each).mean()}

@@ -132,6 +132,10 @@ def test_every_doubt_of_the_verdict_comes_with_advice():
     said = doubts(None, Candidate(np.eye(4), "features", [], evidence), [])  # type: ignore[arg-type]
     assert len(said) >= 4
     assert all(what for _, what in words.advice(said))
+    lacking = replace(evidence, explained=1000, contradicted=60, missing=40)
+    said = doubts(None, Candidate(np.eye(4), "features", [], lacking), [])  # type: ignore[arg-type]
+    assert said[0] == "40 points that lie together are in one scan alone"
+    assert all(what for _, what in words.advice(said))
 
 
 def test_in_a_browser_a_section_moves_and_an_alternative_is_chosen(doubtful, tmp_path, opened):
