@@ -27,12 +27,10 @@ class Surface:
         self.tree = cKDTree(self.points)
 
     @cached_property
-    def _near(self) -> tuple[np.ndarray, np.ndarray]:
-        return neighbours(self.points, self.tree)
-
-    @cached_property
-    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        return normals_and_variation(self.points, *self._near)
+    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        distance, index = neighbours(self.points, self.tree)
+        # Of the neighbours, the nearest 3 alone are kept: all of them are most of what a surface takes of memory.
+        return *normals_and_variation(self.points, distance, index), index[:, 1:4].copy()
 
     @property
     def normals(self) -> np.ndarray:
@@ -56,21 +54,28 @@ class Surface:
         What curvature and noise make of two samples of one surface.
         """
         p, n, off, cosine = self.points, self.normals, [], []
-        for there in self._near[1].T[1:4]:
+        for there in self._shape[4].T:
             off.append(np.abs(np.einsum("ni,ni->n", p[there] - p, n)))
             cosine.append(np.abs(np.einsum("ni,ni->n", n[there], n)))
         return np.mean(off, axis=0), 1 - np.mean(cosine, axis=0)
 
-    def keypoints(self, count: int) -> np.ndarray:
+    def keypoints(self, count: int, block: float | None = None) -> np.ndarray:
         """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.
 
         Where neighbours are far, as in a LiDAR's outskirts, variation is chance: such points come last. What is flat
-        has its keypoints on its outline.
+        has its keypoints on its outline. block: own unit; where it is given, ``count`` is of each block of that edge.
         """
-        _, variation, reach, lean = self._shape
+        _, variation, reach, lean, _ = self._shape
         order = np.argsort(-np.where(reach < SPARSE * self.edge, variation + BORDER * lean, 0.0), kind="stable")
         first = np.unique(voxel_keys((self.points - self.points.min(0))[order], 2 * self.edge), return_index=True)[1]
-        return order[np.sort(first)[:count]]
+        best = order[np.sort(first)]
+        if block is None:
+            return best[:count]
+        keys = voxel_keys(self.points[best] - self.points.min(0), block)
+        together = np.argsort(keys, kind="stable")  # block by block, in each the best first
+        begins = np.flatnonzero(np.diff(keys[together], prepend=-1))
+        rank = np.arange(len(best)) - np.repeat(begins, np.diff(begins, append=len(best)))
+        return best[together[rank < count]]
 
     def patches(self, index: np.ndarray, radius: float, neighbours: int) -> dict[str, np.ndarray]:
         """The neighbourhoods of points ``index`` (K,): what ``patch_encoder.describe_patches`` takes, float32.

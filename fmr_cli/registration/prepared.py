@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 
 import numpy as np
@@ -24,6 +25,7 @@ MIN_POINTS = 10  # fewer say nothing about a surface
 AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more in every voxel
 SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxels
 LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
+AT_A_TIME = 1000  # patches of a map: 100 MB
 KEPT = 6  # results of each kind that a cloud keeps: the grids and features of one pair, for its next pair
 
 
@@ -109,6 +111,26 @@ class Prepared:
             return surface.points[index], encoder(describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS)))
 
         return self._described.get((edge, count, encoder.key), describe)
+
+    def described_evenly(
+        self, edge: float, count: int, block: float, encoder: LocalEncoder, threads: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``described`` with at most ``count`` keypoints in each block of that edge: all of a map, piece by piece."""
+
+        def describe() -> tuple[np.ndarray, np.ndarray]:
+            surface = self.surface(edge)
+            index = surface.keypoints(count, block)
+            _ = surface.normals  # before the threads ask for them
+
+            def some(first: int) -> np.ndarray:
+                patches = surface.patches(index[first : first + AT_A_TIME], PATCH_RADIUS, NEIGHBOURS)
+                return encoder(describe_patches(**patches))
+
+            with ThreadPoolExecutor(threads) as pool:
+                found = list(pool.map(some, range(0, len(index), AT_A_TIME)))
+            return surface.points[index], np.concatenate(found)
+
+        return self._described.get((edge, count, block, encoder.key), describe)
 
     def fine(self, count: int, edge: float) -> np.ndarray:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""

@@ -124,6 +124,17 @@ def test_patches_hold_neighbours_within_the_radius_nearest_first(scan: np.ndarra
     assert patches["valid"][0].sum() == min(brute.sum(), 100)
 
 
+def test_keypoints_are_the_best_of_each_block(scan: np.ndarray) -> None:
+    surface, block, count = Surface(scan, 0.1), 1.0, 5
+    all_of_them = surface.keypoints(len(scan))
+    index = surface.keypoints(count, block)
+    blocks = np.floor((surface.points - surface.points.min(0)) / block).astype(int)
+    for number in np.unique(blocks[all_of_them], axis=0):
+        here = [i for i in all_of_them if (blocks[i] == number).all()]
+        assert [i for i in index if (blocks[i] == number).all()] == here[:count]
+    assert np.array_equal(surface.keypoints(300, 1e6), surface.keypoints(300))
+
+
 @pytest.mark.parametrize(
     "spread", [(1, 1, 1), (1, 1, 1e-3), (1, 1e-3, 1e-3), (1, 1, 0), (1, 0, 0), (1e-9, 1e-9, 1e-11)]
 )

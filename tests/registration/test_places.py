@@ -8,7 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.registration import Options, align, places, prepare
+from fmr_cli.registration.models import local_encoder
+from fmr_cli.registration.pair import Pair
 from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.result import Stopwatch
 from fmr_cli.synthetic import scenes, sensors
 
 APART = 12.0  # m, from room to room
@@ -65,9 +68,11 @@ def test_a_scan_of_a_room_that_the_map_has_twice_is_not_sure() -> None:
 
 def test_parts_keep_to_the_largest_shift_that_is_allowed(rooms: Prepared) -> None:
     source = prepare(PointCloud(surfaces(0, 77)))
-    every, near = (list(places.parts(source, rooms, Options(max_shift=shift))) for shift in (None, APART))
+    every, near = (
+        list(places.part_centres(source, rooms, Options(max_shift=shift), source.reach)) for shift in (None, APART)
+    )
     assert 0 < len(near) < len(every)
-    assert all(np.linalg.norm(part.centre - source.centre) < 3 * APART for part in near)
+    assert all(np.linalg.norm(centre + rooms.centre - source.centre) < 3 * APART for centre in near)
 
 
 def test_clouds_of_about_one_size_are_no_scan_and_map(rooms: Prepared) -> None:
@@ -80,4 +85,39 @@ def test_clouds_of_about_one_size_are_no_scan_and_map(rooms: Prepared) -> None:
 
 def test_a_target_of_too_many_parts_has_none(rooms: Prepared) -> None:
     cup = prepare(PointCloud(surfaces(0, 77) * 0.01))
-    assert list(places.parts(cup, rooms, Options())) == []
+    assert list(places.part_centres(cup, rooms, Options(), cup.reach)) == []
+    assert places.look(cup, rooms, Options(), 1, Stopwatch()) is None
+
+
+def test_a_glance_finds_the_place(rooms: Prepared) -> None:
+    cloud, back = scan(5)
+    source = prepare(cloud)
+    pair = Pair(source, rooms, Options(), places.notched(1.5 * source.edge, rooms), 250)
+    centres = list(places.part_centres(source, rooms, Options(), source.reach))
+    best = pair.leave_centred(places.glance(pair, centres, source.reach)[0].T_target_source)
+    truth = transform_points(back, source.centre[None]) + place(5)
+    assert np.linalg.norm(transform_points(best, source.centre[None]) - truth) < 1
+
+
+def test_a_map_is_described_once_for_scans_of_about_one_size(rooms: Prepared) -> None:
+    lengths = np.linspace(0.1, 0.12, 20)
+    notches = np.array([places.notched(length, rooms) for length in lengths])
+    assert len({*notches}) <= 2
+    assert ((lengths <= notches) & (notches < places.NOTCH * lengths)).all()
+    encoder = local_encoder()
+    assert rooms.described_evenly(0.3, 50, 5.0, encoder) is rooms.described_evenly(0.3, 50, 5.0, encoder)
+
+
+def test_a_notch_has_no_unit_of_its_own(rooms: Prepared) -> None:
+    feet = rooms.scaled(3.28084)
+    assert places.notched(0.4 * 3.28084, feet) == pytest.approx(3.28084 * places.notched(0.4, rooms), rel=1e-6)
+
+
+def test_a_map_is_described_as_a_scan_is(rooms: Prepared) -> None:
+    encoder = local_encoder()
+    keypoints, descriptors = rooms.described(0.3, 2500, encoder)
+    for threads in (1, 2):
+        rooms._described.kept.clear()
+        evenly = rooms.described_evenly(0.3, 2500, 1e6, encoder, threads)
+        assert np.array_equal(evenly[0], keypoints)
+        np.testing.assert_allclose(evenly[1], descriptors, atol=1e-5)
