@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.descriptors.consensus import consensus
+from fmr_cli.descriptors.consensus import BLOCK, SEEDS, agreeing, consensus, spread_seeds
 from fmr_cli.descriptors.matching import match
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.pose_error import angle_between
@@ -70,3 +71,24 @@ def test_descriptors_are_matched_both_ways_without_repetition() -> None:
     order = rng.permutation(20)
     assert match(a, a[order]).tolist() == [[i, int(np.flatnonzero(order == i)[0])] for i in range(20)]
     assert set(match(a, a[:4])[:, 0].tolist()) == set(range(20))  # a point with no twin still has a nearest one
+
+
+def test_agreement_in_blocks_is_that_of_all_at_once() -> None:
+    source, target = matches(0.5, pose((1.0, -2.0, 0.4)), 3 * BLOCK + 5)
+    apart = np.abs(cdist(source, source) - cdist(target, target))
+    agree = agreeing(source, target, TOLERANCE)
+    assert agree.dtype == np.float32
+    clear = np.abs(apart - TOLERANCE) > 1e-4  # single precision decides the rest
+    assert np.array_equal(agree[clear], (apart < TOLERANCE)[clear].astype(np.float32))
+
+
+def test_of_one_place_there_is_one_seed() -> None:
+    source, target = matches(0.3, pose((1.0, -2.0, 0.4)))
+    source, target = np.concatenate([source, source + 0.03]), np.concatenate([target, target - 0.03])
+    agree = agreeing(source, target, TOLERANCE)
+    seeds = spread_seeds(agree, source, target, TOLERANCE, np.ones(len(source), np.float32))
+    assert len(seeds) == SEEDS
+    same = (np.abs(source[seeds, None] - source[seeds]).max(-1) < TOLERANCE) & (
+        np.abs(target[seeds, None] - target[seeds]).max(-1) < TOLERANCE
+    )
+    assert np.array_equal(same, np.eye(SEEDS, dtype=bool))
