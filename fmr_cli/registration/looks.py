@@ -94,16 +94,22 @@ def features(pair: Pair, time: Stopwatch) -> list[Hypothesis]:
         return hypotheses.from_features(pair)
 
 
-def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch) -> None:
-    """Refine and judge the hypotheses that are worth it, best first, and the rivals of what then is likely."""
+def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch, known: float = 0.0) -> None:
+    """Refine and judge the hypotheses that are worth it, best first, and the rivals of what then is likely.
+
+    known: the overlap score of a pose that they are to be better than, if there is one.
+    """
     pair = judge.pair
     with time.stage("refine"):
         ranked = sorted((h for h in found if pair.allowed(h.T_target_source)), key=lambda h: -h.score)
         for hypothesis in ranked[:REFINED]:
-            if hypothesis.score >= WORTH * ranked[0].score and not judge.knows(hypothesis.T_target_source):
+            worth = WORTH * max(ranked[0].score, known)
+            if hypothesis.score >= worth and not judge.knows(hypothesis.T_target_source):
                 judge_refined(judge, hypothesis)
     with time.stage("rivals"):
-        if likely(judge):  # what is not has no need of rivals
+        # What is not likely has no need of rivals; those of a pose that a former look has found are known.
+        if likely(judge) and not np.array_equal(pair.rivals_sought, judge.best.T_target_source):
+            pair.rivals_sought = judge.best.T_target_source
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
             for hypothesis in rivals:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from fmr_cli import PointCloud
 from fmr_cli.cloud import angle_degrees
+from fmr_cli.registration import looks
 from fmr_cli.registration.confidence import Judge
-from fmr_cli.registration.hypotheses import rivals
+from fmr_cli.registration.hypotheses import Hypothesis, rivals
 from fmr_cli.registration.options import Options
-from fmr_cli.registration.pair import make_pair
+from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.result import Stopwatch
 
 
 def box_like() -> np.ndarray:
@@ -61,4 +64,33 @@ def test_a_pose_that_a_refinement_has_spoilt_is_not_known() -> None:
     assert not judge.knows(truth)
     judge.consider(truth, "features", [])
     assert judge.knows(beside @ truth)
+    assert len(judge.candidates) == 1
+
+
+def test_rivals_of_a_pose_are_sought_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = box_like()
+    pair = make_pair(Prepared(PointCloud(points[::2])), Prepared(PointCloud(points[1::2])), Options())
+    judge, sought = Judge(pair), []
+
+    def counted(pair: Pair, T_target_source: np.ndarray) -> tuple[list[Hypothesis], float]:
+        sought.append(T_target_source)
+        return rivals(pair, T_target_source)
+
+    monkeypatch.setattr(looks.hypotheses, "rivals", counted)
+    looks.consider(judge, looks.features(pair, Stopwatch()), Stopwatch())
+    before = judge.candidates
+    looks.consider(judge, looks.features(pair, Stopwatch()), Stopwatch())
+    assert len(sought) == 1
+    assert [c.confidence for c in judge.candidates] == [c.confidence for c in before]
+
+
+def test_what_hardly_overlaps_beside_a_known_pose_is_not_refined() -> None:
+    points = box_like()
+    pair = make_pair(Prepared(PointCloud(points[::2])), Prepared(PointCloud(points[1::2])), Options())
+    far, judge = np.eye(4), Judge(pair)
+    far[:3, 3] = [1.0, 0.7, 0.4]
+    poor = Hypothesis(far, "features", pair.overlap_score(far))
+    looks.consider(judge, [poor], Stopwatch(), known=3 * poor.score)
+    assert judge.candidates == []
+    looks.consider(judge, [poor], Stopwatch(), known=2 * poor.score)
     assert len(judge.candidates) == 1

@@ -12,7 +12,7 @@ from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.errors import CloudFileError, OptionsError, RegistrationError
 from fmr_cli.io import read_transform, write_transform
 from fmr_cli.io.transforms import as_transform
-from fmr_cli.registration import Options, align, mirror
+from fmr_cli.registration import Options, align, looks, mirror
 from fmr_cli.registration.mirror import MIRROR
 from fmr_cli.registration.pipeline import mirror_look, prepare
 from fmr_cli.registration.units import factor_of
@@ -39,6 +39,23 @@ def test_a_mirrored_scan_is_found_on_request_only(tmp_path: Path, clouds: tuple[
     assert np.array_equal(read_transform(tmp_path / "T.txt", mirror=True), found.T_target_source)
     with pytest.raises(CloudFileError, match="would shear or mirror"):
         read_transform(tmp_path / "T.txt")
+
+
+def test_an_image_is_found_beside_a_pose_that_fits_worse_and_not_sought_beside_a_better_one(
+    clouds: tuple[np.ndarray, PointCloud], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, cloud = clouds
+    target, refined = prepare(cloud), []
+    monkeypatch.setattr(looks, "judge_refined", lambda judge, hypothesis: refined.append(judge))
+    mirrored = PointCloud(points * [1, -1, 1])
+    assert mirror_look(PointCloud(points), target, Options()) is None
+    sought = len(refined)
+    assert mirror_look(PointCloud(points), target, Options(), True, prepare(PointCloud(points)), np.eye(4)) is None
+    assert len(refined) - sought < sought
+    monkeypatch.undo()
+    wrong = align(mirrored, target, hints=False)
+    assert wrong.status != "aligned"
+    assert mirror_look(mirrored, target, Options(), True, prepare(mirrored), wrong.T_target_source) is not None
 
 
 def test_where_the_mirror_image_fits_better_a_pose_is_not_believed(clouds: tuple[np.ndarray, PointCloud]) -> None:
