@@ -161,24 +161,33 @@ def about(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return M.T @ information @ M
 
 
-def undetermined(info: np.ndarray, points: np.ndarray, basis: np.ndarray | None = None) -> list[str]:
-    """The directions that the scans hardly determine, in words: those that are HARDLY anything against the strongest.
+def in_frame(information: np.ndarray, T_b_a: np.ndarray) -> np.ndarray:
+    """The information (6, 6) of a twist in frame a, about its origin, as that of the twist in frame b, about b's."""
+    M = adjoint(np.linalg.inv(T_b_a))
+    return M.T @ information @ M
 
-    Motions compare by how far they move a scan's points, root mean square: along a street a roll moves them little.
-    info: (6, 6) of the twist about the scan's centre; points (N, 3): of the scan, about its centre, in the same axes;
-    basis: (6, d) orthonormal twists that the motion may use, None for all six.
+
+def weak_twists(info: np.ndarray, points: np.ndarray, basis: np.ndarray | None = None) -> np.ndarray:
+    """The twists (6, k) that the scans hardly determine: those that are HARDLY anything against the strongest.
+
+    Motions compare by how far they move a scan's points, root mean square, which is 1 for each of these: along a street
+    a roll moves them little. info: (6, 6) of the twist about the scan's centre; points (N, 3): of the scan, about its
+    centre, in the same axes; basis: (6, d) orthonormal twists that the motion may use, None for all six.
     """
     B = np.eye(6) if basis is None else basis
     second = points.T @ points / len(points)
     moved = np.eye(6)  # mean square displacement of the points by a twist x is xᵀ moved x
     moved[:3, :3] = np.trace(second) * (1 + 1e-6) * np.eye(3) - second
     values, vectors = eigh(B.T @ info @ B, B.T @ moved @ B)
+    return (B @ vectors)[:, values <= HARDLY * max(values[-1], 1e-300)]
+
+
+def undetermined(info: np.ndarray, points: np.ndarray, basis: np.ndarray | None = None) -> list[str]:
+    """The same in words."""
     said = []
-    for value, vector in zip(values, (B @ vectors).T, strict=True):
-        if value > HARDLY * max(values[-1], 1e-300):
-            continue
+    for vector in weak_twists(info, points, basis).T:
         omega, v = vector[:3], vector[3:]
-        turns = omega @ moved[:3, :3] @ omega > v @ v  # more than it shifts
+        turns = v @ v < 0.5  # of the mean square displacement: it turns more than it shifts
         axis = omega if turns else v
         kind = "rotation about" if turns else "shift along"
         said.append(f"{kind} {direction(axis)}")

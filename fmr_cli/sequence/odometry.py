@@ -15,7 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fmr_cli.cloud import transform_points
 from fmr_cli.errors import RegistrationError
+from fmr_cli.geometry.observability import about, in_frame, weak_twists
+from fmr_cli.registration.confidence import ALIGNED
 from fmr_cli.registration.options import Options
 from fmr_cli.sequence.feature_error import feature_errors
 from fmr_cli.sequence.known_map import KnownMap
@@ -185,12 +188,14 @@ class Odometry:
             return best
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
-        if found.status != "aligned" and self.usual and not self._usual(by_features):
+        sure = found.status == "aligned"
+        if not (sure or self._fits(best) or self._fits(by_features)):
+            sure = self._borne_out(scan, T_map_features, by_features)
+        if not sure:
             # A leap that nothing vouches for: a passage's corner fits another one in several ways.
-            return by_features if CLEARLY * by_features.total < best.total else best
+            clearly = CLEARLY if self.usual and not self._usual(by_features) else 1.0
+            return by_features if clearly * by_features.total < best.total else best
         best = min(best, by_features, key=lambda fit: fit.total)
-        if found.status != "aligned":
-            return best
         if not self._fits(best):
             best = by_features
         if displacement(best.T_map_scan, T_map_features, scan.points) > FINE:
@@ -207,6 +212,37 @@ class Odometry:
             self.by_features = index, scan, found
         found = self.by_features[2]
         return found, T_map_last @ found.T_target_source
+
+    def _borne_out(self, scan: PreparedScan, T_map_features: np.ndarray, fit: Fit) -> bool:
+        """Whether all points of a scan and of the last one put it where their thinned ones do, and surely.
+
+        Of two scans across a gap, thinning may leave hardly more than a corner in common, which fits any other. In
+        corridors all points alone are no surer: both must say the same. What the two do not determine is no doubt where
+        the map does. fit: of the scan onto the map, from T_map_features.
+        """
+        from fmr_cli.registration import align
+
+        _, last, T_map_last = self.last
+        source, target = scan.whole_for_align(), last.whole_for_align()
+        found = align(source, target, replace(self.pair, init="features"), hints=False)
+        T_map_scan = T_map_last @ found.T_target_source
+        if found.confidence < ALIGNED or displacement(T_map_scan, T_map_features, scan.points) > FINE:
+            return False
+        if found.status == "aligned":
+            return True
+        fit, _ = self.map.polish(scan, fit, 0.0)
+        if fit.seen is None or displacement(fit.T_map_scan, T_map_scan, scan.points) > FINE:
+            return False
+        of_pair = about(in_frame(about(found.information, -found.origin), T_map_last), fit.seen.centre)
+        weak = weak_twists(of_pair, transform_points(fit.T_map_scan, scan.points) - fit.seen.centre)
+        of_map = np.linalg.eigvalsh(weak.T @ fit.seen.information @ weak)
+        return bool(of_map.min(initial=np.inf) > MATTERS**-2)
+
+    def _remember(self, index: int, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
+        """This is the scan before the next one; nobody will ask for all points of the one before it."""
+        if self.last[1] is not scan:
+            self.last[1].whole = None
+        self.last = (index, scan, T_map_scan)
 
     def _fits(self, fit: Fit) -> bool:
         usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
@@ -309,7 +345,7 @@ class Odometry:
         self.usual.append((fit.overlap, fit.total))
         self.aligned, self.uncertain = self.aligned + 1, 0
         self.motion.advance(fit.T_map_scan, expected, fit.seen)
-        self.last = (index, scan, fit.T_map_scan)
+        self._remember(index, scan, fit.T_map_scan)
         self.best_total = min(self.best_total, fit.total)
         moved = displacement(fit.T_map_scan, self.map.keyframes[-1].T_map_scan, scan.points)
         if fit.total > KEYFRAME_RISE * self.best_total or moved > KEYFRAME_MOTION:
@@ -323,7 +359,7 @@ class Odometry:
         T_map_scan = expected.T_map_scan
         self.motion.advance(T_map_scan, expected, None)
         if scan is not None:
-            self.last = (index, scan, T_map_scan)
+            self._remember(index, scan, T_map_scan)
             if self.uncertain >= LOST_AFTER:
                 self._begin_again(index, scan)
         T_first_scan = self.frame.pose_to_file(self.motion.T_map_scan)
@@ -340,7 +376,7 @@ class Odometry:
         self.map.insert(index, scan, T_map_scan)
         self.usual.clear()
         self.motion.forget_place(T_map_scan)
-        self.last = (index, scan, T_map_scan)
+        self._remember(index, scan, T_map_scan)
 
     def _frame(self, fit: Fit) -> Frame:
         """What came of a scan that fits."""
@@ -389,5 +425,7 @@ class Odometry:
         self.usual.extend((overlap, total) for overlap, total in state["usual"])
         self.slopes.extend(state["slopes"])
         for index in state["map"]:
-            self.map.insert(index, load(index), T_map_scan[index])
+            keyframe = load(index)
+            keyframe.whole = None
+            self.map.insert(index, keyframe, T_map_scan[index])
         self.last = (state["last"], load(state["last"]), T_map_scan[state["last"]])

@@ -51,11 +51,13 @@ class PreparedScan:
     """A scan in voxels: thinned ``points`` (N, 3), unit ``normals`` towards the sensor, ``ranges`` (N,) from it.
 
     ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``cloud`` is the same for
-    small_gicp, with a covariance per point.
+    small_gicp, with a covariance per point. ``whole``: (M, 3) float32, the points before thinning; None once nobody
+    will ask for them, since a map of whole scans would take too much memory.
     """
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray) -> None:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels."""
+        self.whole: np.ndarray | None = points.astype(np.float32)
         # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
         self.cloud = small_gicp.PointCloud(small_gicp.voxelgrid_sampling(points, 1.0).points())
         self.points = np.ascontiguousarray(self.cloud.points()[:, :3])
@@ -124,6 +126,12 @@ class PreparedScan:
         from fmr_cli.registration.pipeline import prepare
 
         return prepare(PointCloud(self.points))
+
+    def whole_for_align(self) -> Prepared:
+        """The same with all of its points; of the thinned ones where these are gone."""
+        from fmr_cli.registration.pipeline import prepare
+
+        return self.for_align if self.whole is None else prepare(PointCloud(self.whole.astype(float)))
 
 
 def neighbours(tree: small_gicp.KdTree, points: np.ndarray, count: int) -> np.ndarray:

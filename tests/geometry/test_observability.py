@@ -8,7 +8,7 @@ import pytest
 from fmr_cli.geometry import observability
 from fmr_cli.geometry.point_to_plane import point_to_plane, step_motion
 from fmr_cli.geometry.sampling import working_scale
-from fmr_cli.geometry.se3 import log
+from fmr_cli.geometry.se3 import adjoint, exp, log
 from fmr_cli.geometry.surface import Surface
 
 Scans = tuple[np.ndarray, np.ndarray]
@@ -184,3 +184,11 @@ def test_a_direction_that_one_block_alone_holds_is_no_division_by_nothing() -> N
     found = observability.sandwich(J, pull, np.ones(48), block)
     assert np.isfinite(found).all()
     assert 0.3 < np.sqrt(found[0, 0] * 8) < 3  # of unit noise, seen eight times
+
+
+def test_information_says_the_same_of_a_motion_in_another_frame() -> None:
+    rng = np.random.default_rng(0)
+    J, in_a, T_b_a = rng.normal(size=(6, 9)), rng.normal(size=6), exp(rng.normal(size=6))
+    information, in_b = J @ J.T, adjoint(T_b_a) @ in_a
+    moved = observability.in_frame(information, T_b_a)
+    assert np.isclose(in_b @ moved @ in_b, in_a @ information @ in_a)

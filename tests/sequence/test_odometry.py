@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,6 +77,68 @@ def test_a_leap_that_registration_is_not_sure_of_has_to_fit_clearly_better(turni
     fits = {"features": Fit(elsewhere, overlap, 1.0, "features")}
     monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: fits.get(name, Fit(T, 0.35, 1.0, name)))
     assert odometry._best_fit(prepare_scan(scans[5], frame), odometry.motion.expect(None, 1.0)).start == start
+
+
+@pytest.fixture
+def at_a_gap(turning):
+    """An odometry after three scans of the bend, the fourth one, where it is in the map, and its fit there."""
+    scans = turning[0]
+    frame = VoxelFrame(choose_voxel(scans[0]), np.median(scans[0], axis=0))
+    odometry = Odometry(frame)
+    for points in scans[:3]:
+        odometry.register(prepare_scan(points, frame))
+    scan = prepare_scan(scans[3], frame)
+    T_map_scan = odometry._best_fit(scan, odometry.motion.expect(None, 1.0)).T_map_scan
+    return odometry, scan, T_map_scan, odometry.map.fit(scan, T_map_scan, (1.0,), "features")
+
+
+def said_by_whole_scans(monkeypatch, odometry, T_map_scan, **said):
+    """Registration of whole scans says so."""
+    T_last_scan = np.linalg.inv(odometry.last[2]) @ T_map_scan
+    found = {"T_target_source": T_last_scan, "origin": np.zeros(3), "information": 1e4 * np.eye(6)} | said
+    monkeypatch.setattr("fmr_cli.registration.align", lambda *args, **options: SimpleNamespace(**found))
+
+
+@pytest.mark.parametrize(
+    ("off", "status", "confidence", "sure"),
+    [(0.0, "aligned", 0.9, True), (0.0, "uncertain", 0.6, False), (3.0, "aligned", 0.9, False)],
+)
+def test_across_a_gap_all_points_must_put_a_scan_where_the_thinned_ones_do(
+    at_a_gap, monkeypatch, off, status, confidence, sure
+):
+    odometry, scan, T_map_scan, fit = at_a_gap
+    said_by_whole_scans(monkeypatch, odometry, placed(off) @ T_map_scan, status=status, confidence=confidence)
+    assert odometry._borne_out(scan, T_map_scan, fit) == sure
+
+
+def test_then_a_scan_that_fits_nothing_is_no_gap(at_a_gap, monkeypatch):
+    odometry, scan, T_map_scan, _ = at_a_gap
+    monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), T_map_scan))
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: Fit(T, 0.2, 1.0, name))
+    for sure in (True, False):
+        monkeypatch.setattr(odometry, "_borne_out", lambda scan, T, fit, sure=sure: sure)
+        fit = odometry._best_fit(scan, odometry.motion.expect(None, 1.0))
+        assert odometry._fits(fit) == sure
+        assert not sure or np.allclose(fit.T_map_scan, T_map_scan)
+
+
+@pytest.mark.parametrize("observed", [True, False])
+def test_what_two_scans_across_a_gap_leave_open_the_map_has_to_determine(at_a_gap, monkeypatch, observed):
+    odometry, scan, T_map_scan, fit = at_a_gap
+    along = np.eye(6)[5]
+    weak = 1e4 * (np.eye(6) - np.outer(along, along))  # says nothing of a shift along the third axis
+    said_by_whole_scans(monkeypatch, odometry, T_map_scan, status="uncertain", confidence=0.9, information=weak)
+    if not observed:
+        fit, _ = odometry.map.polish(scan, fit, 0.0)
+        seen = replace(fit.seen, information=np.zeros((6, 6)))
+        monkeypatch.setattr(odometry.map, "polish", lambda scan, fit, slope: (replace(fit, seen=seen), slope))
+    assert odometry._borne_out(scan, T_map_scan, fit) == observed
+
+
+def test_all_points_are_kept_of_the_last_scan_alone(at_a_gap):
+    odometry = at_a_gap[0]
+    assert odometry.last[1].whole is not None
+    assert all(k.scan.whole is None for k in odometry.map.keyframes if k.scan is not odometry.last[1])
 
 
 def test_the_unit_and_the_place_do_not_matter(turning, first_four):
