@@ -37,6 +37,8 @@ from fmr_cli.registration.confidence import (
 from fmr_cli.registration.verdict_weights import Weights
 from fmr_cli.report.calibration import calibration_table, plot_calibration
 
+LEAST = 50  # pairs: a kind each
+
 
 def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     """How often right poses have what bounds the confidence, whatever the weights say (``confidence.confidences``)."""
@@ -61,11 +63,13 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pairs", type=int, default=1500, help="of scans, at least 50")
+    parser.add_argument("--pairs", type=int, default=1500, help=f"of scans, at least {LEAST}")
     parser.add_argument("--seed", type=int, default=20_000)
     parser.add_argument("--workers", type=int, help="processes; the figures do not depend on it")
     parser.add_argument("--out", type=Path, default=Path("calibration"))
     args = parser.parse_args()
+    if args.pairs < LEAST:
+        parser.error(f"--pairs {args.pairs}: at least {LEAST}, or a fifth of them holds no right pose")
     args.out.mkdir(exist_ok=True, parents=True)
     evidence = gather(args.pairs, args.seed, args.workers)
     confidence, right = cross_validated(evidence)

@@ -96,7 +96,7 @@ def mirror_look(
 
     Unless thorough, fine voxels are looked at only where coarse ones make it likely: most pairs that are not aligned
     fit in no way, mirrored or not, and the fine look is several times as dear as the coarse one. known: where a pose of
-    the source, ``prepared``, is given, what hardly overlaps beside it is not refined: it cannot fit better.
+    the source, ``prepared``, is given, what hardly overlaps beside it is not refined.
     """
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):
