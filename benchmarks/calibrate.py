@@ -49,13 +49,13 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     poses = np.concatenate([j.x[j.right] for j in evidence])
     stretched = -poses[:, STRETCH] > 100 * OTHER_SCALE
     said = [f"fits better by another scale: {stretched.sum()} of {len(poses)} right poses"]
-    alike = np.array([rivalled(j.x, w, weights) for j, w in zip(evidence, weigh, strict=True)])
+    alike = np.array([rivalled(j.x, j.largest, w, weights) for j, w in zip(evidence, weigh, strict=True)])
     for name, holds in (
         ("more contradicted than explained", seen[:, CONTRADICTION] < 0),
         ("a third missing", seen[:, MISSING] < LACKING_MUCH),
         ("hardly anything explained", seen[:, SHARE] < np.log(SCANT)),
         ("hardly more than three planes", seen[:, DETAIL] < detail_log(BARE)),
-        ("hardly more is missing at a close rival", alike),
+        ("nothing stands out at a close rival", alike),
     ):
         said.append(f"{name}: {good[holds].sum()} of {holds.sum()} poses that stood first were right")
     return said

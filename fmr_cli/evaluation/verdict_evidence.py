@@ -30,13 +30,14 @@ CHUNK = 2  # pairs handed to a worker at a time: a pair takes a second, a hand-o
 
 @dataclass(frozen=True)
 class Judged:
-    """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool.
+    """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool; largest: (n,).
 
     kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
     """
 
     x: np.ndarray
     right: np.ndarray
+    largest: np.ndarray
     kind: str
     unique: bool
     number: int
@@ -67,7 +68,8 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
                 right = [bool(truth) and pair.of(truth).is_right(T, RIGHT_DEGREES, RIGHT_SHARE) for T in poses]
                 x = np.array([c.evidence.vector() for c in judge.candidates])
                 if len(x):
-                    found.append(Judged(x, np.array(right), pair.kind, pair.unique, seed[1]))
+                    largest = np.array([c.evidence.largest for c in judge.candidates])
+                    found.append(Judged(x, np.array(right), largest, pair.kind, pair.unique, seed[1]))
     except RegistrationError:  # a street and a teacup: nothing to judge
         return []
     return found

@@ -79,7 +79,7 @@ def judge(evidence: Sequence[Judged], weights: Weights) -> tuple[np.ndarray, np.
     """What ``align`` would say of each look: the confidence of its best pose (n,), and whether that is right (n,)."""
     said = []
     for j in evidence:
-        shares, weigh = confidences(j.x, weights)
+        shares, weigh = confidences(j.x, j.largest, weights)
         best = int(weigh.argmax())
         said.append((shares[best], j.right[best]))
     confidence, right = zip(*said, strict=True)

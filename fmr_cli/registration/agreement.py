@@ -13,6 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from fmr_cli.cloud import transform_points
@@ -32,6 +34,7 @@ AT_BORDER = 0.25
 # too where a thing is missing: 6 of 8. On made-up pairs that repeat, aliases have at most a few such points among up to
 # a hundred contradicted ones; where a key, a door or some furniture tells a pose from its like, there are tens.
 LIKE, MOSTLY, LIKE_REACH = 8, 6, 3.0
+ONE_THING = 1.5  # voxel edges within which contradicted points are of one thing: next to each other on the grid
 STRETCH_POINTS = 1500  # of the source, on which a change of scale is tried
 STRETCH_REACH = 2.5  # voxel edges
 STRETCH_SIGMAS = 3.0  # deviations that chance may explain
@@ -43,7 +46,7 @@ class Agreement:
     """What two surfaces say of a pose, both ways taken together.
 
     explained, contradicted: points, of both. missing: of the contradicted ones, those in the midst of others: a thing
-        that one scan has and the other one lacks.
+        that one scan has and the other one lacks. largest: those of the largest cluster of each scan, a small thing's.
     overlap: share of the smaller scan within TOUCHING of the other one.
     explained_share: the same, of points that are explained.
     inlier_rmse: how far touching points lie off each other's tangent planes, root mean square, own unit. It hardly
@@ -59,6 +62,7 @@ class Agreement:
     explained: int
     contradicted: int
     missing: int
+    largest: int
     overlap: float
     explained_share: float
     inlier_rmse: float
@@ -70,7 +74,7 @@ class Agreement:
 
 def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> Agreement:
     """Compare two surfaces on the same voxel edge at a pose between their frames."""
-    shares, explained_shares, sums, detail, missing = [], [], np.zeros(7), 0.0, 0
+    shares, explained_shares, sums, detail, missing, largest = [], [], np.zeros(7), 0.0, 0, 0
     for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
         moved = transform_points(T, a.points)
         distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
@@ -94,6 +98,7 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
         ]  # fmt: skip
         judged = explained | contradicted
         missing += amid_their_like(moved[here[judged]], contradicted[judged], LIKE_REACH * b.edge)
+        largest += largest_cluster(moved[here[contradicted]], ONE_THING * b.edge)
         common, rng = here[explained], np.random.default_rng(0)
         detail += len(common) * share_beyond_corner(moved[common], n[explained], b.edge, rng)
         shares.append(touching.sum() / max(a.solid.sum(), 1))
@@ -103,6 +108,7 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
         explained=int(sums[0]),
         contradicted=int(sums[1]),
         missing=missing,
+        largest=largest,
         overlap=float(max(shares)),
         explained_share=float(max(explained_shares)),
         inlier_rmse=float(np.sqrt(off2)) * target.edge if sums[2] else float("inf"),
@@ -119,6 +125,15 @@ def amid_their_like(points: np.ndarray, some: np.ndarray, reach: float) -> int:
         return 0
     index = cKDTree(points).query(points[some], LIKE, distance_upper_bound=reach)[1]
     return int((np.append(some, False)[index].sum(1) >= MOSTLY).sum())  # index N: nothing so near
+
+
+def largest_cluster(points: np.ndarray, reach: float) -> int:
+    """How many of points (N, 3) the largest cluster has: each within ``reach`` of another one of it."""
+    if not len(points):
+        return 0
+    near = cKDTree(points).query_pairs(reach, output_type="ndarray")
+    links = coo_matrix((np.ones(len(near), bool), near.T), shape=(len(points), len(points)))
+    return int(np.bincount(connected_components(links, directed=False)[1]).max())
 
 
 def stretch(source: Surface, target: Surface, T_target_source: np.ndarray) -> float:

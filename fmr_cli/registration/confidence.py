@@ -29,20 +29,21 @@ MOST_STRETCH = 0.05  # a stretch beyond it is as bad
 AS_GOOD = 1.5  # times as close as a surface's own neighbours: beyond, points are the same, and no surer for it
 # What no other evidence outweighs, and the confidence that it leaves at most; by the looks at 1,400 made-up pairs, bent
 # ones too (`python -m benchmarks.calibrate` counts them). Such pairs are too few for the weights to say so themselves.
-OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: 1 of 2156 right poses had that
+OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: 1 of 2160 right poses had that
 DENIED = 0.1  # more contradicted than explained: none of 57 poses that stood first was right
 # More than a third as many points missing as explained (1 : e): 17 of 219 were right. Furniture that was moved,
 # another scale, another place of the like.
 LACKING_MUCH, IF_LACKING = 1.0, 0.3
-# Less than a tenth of the smaller scan explained: 11 of 36 were right, and streets turned end to end fit so.
+# Less than a tenth of the smaller scan explained: 13 of 38 were right, and streets turned end to end fit so.
 SCANT, IF_SCANT = 0.1, 0.5
-# Fewer points of detail than that, hardly more than a corner, which fits any other: 21 of 140 were right.
+# Fewer points of detail than that, hardly more than a corner, which fits any other: 21 of 141 were right.
 BARE, IF_BARE = 5, 0.3
-# A rival that has ABOUT as much support and weighs NEARLY as much, where hardly more is missing (LACKING: e times, by
-# the logarithm): one of the like may stand first for being seen from the same side in both scans, as bays of a rack.
-# Wrong is SO_MANY times as likely then, by hand: on 256 pairs, most of things that repeat, 15 aligned ones were wrong
-# without it, 12 with it, and 113 of 115 right ones stayed; on the 1,400, 22 of 690 and 15 of 672.
-ABOUT, NEARLY, LACKING, SO_MANY = 0.9, 0.1, 1.0, 4.0
+# A rival that has ABOUT as much support and weighs NEARLY as much, where no thing stands out that one scan lacks (the
+# largest has less than STANDS_OUT times as many points as the pose's own): one of the like may stand first for being
+# seen from the same side in both scans, as bays of a rack. Wrong is SO_MANY times as likely then, by hand: on 1,400
+# pairs 12 of 667 aligned ones were wrong at full looks, 19 of 683 without it.
+ABOUT, NEARLY, STANDS_OUT, SO_MANY = 0.9, 0.1, 2.0, 4.0
+BY_CHANCE = 3  # points of the largest cluster that edges make: too few to be told from none
 SURE_LOGIT = 50.0  # beyond it exp() has no more to say
 LIKELY = 0.5  # support from which a pose would be called right if it were alone
 RIVAL_SUPPORT = 0.3  # from which a pose counts as a rival: by itself it may be right
@@ -124,15 +125,16 @@ def products(standings: np.ndarray, weights: Weights) -> np.ndarray:
     return np.column_stack([np.ones(len(z)), z, z[:, i] * z[:, j]])
 
 
-def confidences(x: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+def confidences(x: np.ndarray, largest: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
     """The probability of each of several distinct poses, of which at most one is right; what each weighs among them.
 
-    x: (n, d) their evidence. The first has what the verdict gives it, the others share the rest.
+    x: (n, d) their evidence, largest (n,): see ``Agreement``. The first has what the verdict gives it, the others share
+    the rest.
     """
     weigh, first = standing(x, weights)
     best = int(weigh.argmax())
     logit = products(first[None], weights) @ weights.verdict
-    p = float(sigmoid(logit - np.log(SO_MANY) * rivalled(x, weigh, weights))[0])
+    p = float(sigmoid(logit - np.log(SO_MANY) * rivalled(x, largest, weigh, weights))[0])
     p = min(p, most(x[best]))
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
@@ -161,16 +163,16 @@ def most(x: np.ndarray) -> float:
     return min([p for holds, p in bounds if holds], default=1.0)
 
 
-def rivalled(x: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
-    """Whether the first of poses has a close rival where hardly more is missing.
+def rivalled(x: np.ndarray, largest: np.ndarray, weigh: np.ndarray, weights: Weights) -> bool:
+    """Whether the first of poses has a close rival where no thing stands out that one scan has and the other one lacks.
 
-    Close is what is about as likely by itself and fits nearly as well. x: (n, d) the evidence of distinct poses; weigh:
-    (n,) what each weighs among them, see ``standing``.
+    Close is what is about as likely by itself and fits nearly as well. x: (n, d) the evidence of distinct poses;
+    largest (n,): see ``Agreement``; weigh: (n,) what each weighs among them, see ``standing``.
     """
     best, supports = int(weigh.argmax()), support(x, weights)
     others = (supports >= ABOUT * supports[best]) & (weigh >= NEARLY * weigh[best])
     others[best] = False
-    return bool((x[others, MISSING] > x[best, MISSING] - LACKING).any())
+    return bool((largest[others] + BY_CHANCE < STANDS_OUT * (largest[best] + BY_CHANCE)).any())
 
 
 @dataclass
@@ -222,11 +224,11 @@ class Judge:
     def weigh(self, candidates: list[Candidate]) -> None:
         """Weigh candidates against each other, best first, in a scene that repeats itself as much as is known."""
         seen = [replace(c.evidence, repeats=self.repeats) for c in candidates]
-        x = np.array([e.vector() for e in seen])
+        x, largest = np.array([e.vector() for e in seen]), np.array([e.largest for e in seen])
         weighed = [
             replace(c, evidence=e, support=float(s), weight=float(w), confidence=float(p))
             for c, e, s, w, p in zip(
-                candidates, seen, support(x, self.weights), *confidences(x, self.weights)[::-1], strict=True
+                candidates, seen, support(x, self.weights), *confidences(x, largest, self.weights)[::-1], strict=True
             )
         ]
         self.candidates = sorted(weighed, key=lambda c: -c.weight)

@@ -40,6 +40,7 @@ EVIDENCE = {
     "explained": ("points explained", "lie on the other surface and face along with it"),
     "contradicted": ("points that contradict", "float off a surface that the other scan saw there"),
     "missing": ("points of missing things", "of the latter, those that lie together: a thing that one scan lacks"),
+    "largest": ("points of the largest one", "of those that contradict, the largest cluster of each scan"),
     "overlap": ("overlap", "share of the smaller scan near the other one"),
     "explained_share": ("overlap that is explained", "the same, counting explained points only"),
     "inlier_rmse": ("RMSE", "to the surface of the other scan"),

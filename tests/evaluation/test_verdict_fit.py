@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ def drawn() -> list[Judged]:
         x[:, bounding] = np.abs(x[:, bounding])  # nothing that bounds a confidence by itself
         right = np.zeros(3, bool)
         right[0] = rng.random() < 1 / (1 + np.exp(-2 * x[0, 1]))
-        looks.append(Judged(x, right, "drawn", True, number))
+        looks.append(Judged(x, right, np.zeros(3), "drawn", True, number))
     return looks
 
 
@@ -38,13 +40,12 @@ def test_confidence_is_the_share_that_is_right(drawn):
 
 
 def test_no_kind_counts_against_its_own_sense(drawn):
-    against = [Judged(j.x * [1, -1, *[1] * 9], j.right, j.kind, j.unique, j.number) for j in drawn]
+    against = [replace(j, x=j.x * [1, -1, *[1] * 9]) for j in drawn]
     assert fit(against).support[1] == 0
 
 
 def test_what_is_missing_tells_among_rivals_alone(drawn):
-    told = [Judged(np.where(np.arange(11) == MISSING, 3.0 * j.right[:, None], j.x), j.right, j.kind, j.unique, j.number)
-            for j in drawn]  # fmt: skip
+    told = [replace(j, x=np.where(np.arange(11) == MISSING, 3.0 * j.right[:, None], j.x)) for j in drawn]
     weights = fit(told)
     assert weights.support[MISSING] == 0
     assert weights.fit[MISSING - QUALITY.start] > 0

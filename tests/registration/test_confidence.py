@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration import confidence
-from fmr_cli.registration.agreement import agreement, amid_their_like
+from fmr_cli.registration.agreement import agreement, amid_their_like, largest_cluster
 from fmr_cli.registration.pipeline import align
 from fmr_cli.registration.verdict_weights import bundled_weights
 
@@ -30,28 +30,29 @@ def pose(angle: float, shift: float) -> np.ndarray:
 def evidence(**given: float) -> confidence.Evidence:
     """What a good pose of two rooms has, but for what is given."""
     usual = {
-        "explained": 8000, "contradicted": 100, "missing": 0, "overlap": 0.9, "explained_share": 0.8,
+        "explained": 8000, "contradicted": 100, "missing": 0, "largest": 2, "overlap": 0.9, "explained_share": 0.8,
         "inlier_rmse": 0.01, "offset": 0.7, "turn": 1.0, "detail": 2000, "stretch": 0.0, "votes": 200, "repeats": 0.15,
     }  # fmt: skip
     return confidence.Evidence(**(usual | given))  # type: ignore[arg-type]
 
 
 def said(*poses: confidence.Evidence) -> list[float]:
-    return confidence.confidences(np.array([e.vector() for e in poses]), bundled_weights())[0].tolist()
+    x, largest = np.array([e.vector() for e in poses]), np.array([e.largest for e in poses])
+    return confidence.confidences(x, largest, bundled_weights())[0].tolist()
 
 
-def test_a_rival_that_fits_nearly_as_well_is_doubt_unless_something_is_missing_there() -> None:
-    """One bay of a facade is seen from the same side in both scans, and fits a little better for it."""
+def test_a_rival_that_fits_nearly_as_well_is_doubt_unless_a_thing_stands_out_there() -> None:
+    """One bay of a facade is seen from the same side in both scans, and fits a little better for it: or by its door."""
     first = evidence(explained=4300, contradicted=20, offset=0.95, votes=280, repeats=0.4)
     beside = evidence(explained=3800, contradicted=70, offset=1.0, votes=200, repeats=0.4)
-    lacking = evidence(explained=3800, contradicted=70, missing=60, offset=1.0, votes=200, repeats=0.4)
+    lacking = evidence(explained=3800, contradicted=70, missing=20, largest=26, offset=1.0, votes=200, repeats=0.4)
     assert said(first)[0] > confidence.ALIGNED
     assert said(first, beside)[0] < said(first, lacking)[0]
     assert said(first, lacking)[0] > confidence.ALIGNED
     weights = bundled_weights()
     for rival, doubted in ((beside, True), (lacking, False)):
-        x = np.array([e.vector() for e in (first, rival)])
-        assert confidence.rivalled(x, confidence.standing(x, weights)[0], weights) == doubted
+        x, largest = np.array([e.vector() for e in (first, rival)]), np.array([first.largest, rival.largest])
+        assert confidence.rivalled(x, largest, confidence.standing(x, weights)[0], weights) == doubted
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -124,6 +125,15 @@ def test_a_missing_thing_lies_together_and_edges_here_and_there() -> None:
     assert amid_their_like(wall, door, 3.0) > 0.7 * door.sum()
     assert amid_their_like(wall, scattered, 3.0) < 0.02 * door.sum()
     assert amid_their_like(wall, door & (np.arange(len(wall)) < 2), 3.0) == 0
+
+
+def test_a_small_thing_is_one_cluster_and_edges_are_many() -> None:
+    grid = np.array([[x, y, 0.0] for x in range(60) for y in range(60)])
+    door = (np.abs(grid[:, 0] - 30) < 2) & (np.abs(grid[:, 1] - 20) < 4)
+    scattered = np.random.default_rng(0).permutation(door)
+    assert largest_cluster(grid[door], 1.5) == door.sum()
+    assert largest_cluster(grid[scattered], 1.5) <= confidence.BY_CHANCE
+    assert largest_cluster(grid[:0], 1.5) == 0
 
 
 def test_poses_that_fit_as_well_are_not_sure() -> None:

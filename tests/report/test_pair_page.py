@@ -126,8 +126,8 @@ def test_ten_points(tmp_path, pair):
 
 def test_every_doubt_of_the_verdict_comes_with_advice():
     evidence = Evidence(
-        explained=10, contradicted=90, missing=60, overlap=0.1, explained_share=0.01, inlier_rmse=1.0, offset=9.0,
-        turn=9.0, detail=0, stretch=0.04, votes=1, repeats=0.0,
+        explained=10, contradicted=90, missing=60, largest=40, overlap=0.1, explained_share=0.01, inlier_rmse=1.0,
+        offset=9.0, turn=9.0, detail=0, stretch=0.04, votes=1, repeats=0.0,
     )  # fmt: skip
     said = doubts(None, Candidate(np.eye(4), "features", [], evidence), [])  # type: ignore[arg-type]
     assert len(said) >= 4
