@@ -197,11 +197,13 @@ class Judge:
     """Weighs the poses of one pair against each other.
 
     candidates: distinct poses, best first. repeats: how much of the scene repeats itself, see ``hypotheses.rivals``.
+    rivals_of: the pose whose rivals have been tried last, empty if none.
     """
 
     pair: Pair
     repeats: float = 0.0
     candidates: list[Candidate] = field(default_factory=list)
+    rivals_of: np.ndarray = field(default_factory=lambda: np.empty(0))
     weights: Weights = field(init=False)
 
     def __post_init__(self) -> None:

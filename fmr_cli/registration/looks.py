@@ -97,7 +97,7 @@ def features(pair: Pair, time: Stopwatch) -> list[Hypothesis]:
 def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch, known: float = 0.0) -> None:
     """Refine and judge the hypotheses that are worth it, best first, and the rivals of what then is likely.
 
-    known: the overlap score of a pose that they are to be better than, if there is one.
+    known: the overlap score of a pose that is known already, if any: what has little beside it is not worth it.
     """
     pair = judge.pair
     with time.stage("refine"):
@@ -108,8 +108,8 @@ def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch, known: floa
                 judge_refined(judge, hypothesis)
     with time.stage("rivals"):
         # What is not likely has no need of rivals; those of a pose that a former look has found are known.
-        if likely(judge) and not np.array_equal(pair.rivals_sought, judge.best.T_target_source):
-            pair.rivals_sought = judge.best.T_target_source
+        if likely(judge) and not np.array_equal(judge.rivals_of, judge.best.T_target_source):
+            judge.rivals_of = judge.best.T_target_source
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
             for hypothesis in rivals:

@@ -48,7 +48,6 @@ class Pair:
         lift = float(up @ (source.centre - target.centre))  # what "planar" keeps of the shift between centred frames
         self.motion = Motion(options.dof, (float(up[0]), float(up[1]), float(up[2])), lift)
         self.s, self.t = source.surface(edge), target.surface(edge)
-        self.rivals_sought = np.zeros((0, 4))  # the pose whose rivals have been tried last, if any
         for cloud, surface in ((source, self.s), (target, self.t)):
             if len(surface.points) < MIN_POINTS:
                 what = f"fewer than {MIN_POINTS} voxels of {edge:.3g} hold points; lower --voxel-size"
