@@ -46,7 +46,8 @@ class Agreement:
     """What two surfaces say of a pose, both ways taken together.
 
     explained, contradicted: points, of both. missing: of the contradicted ones, those in the midst of others: a thing
-        that one scan has and the other one lacks. largest: those of the largest cluster of each scan, a small thing's.
+        that one scan has and the other one lacks. largest: of the contradicted ones, those of the largest cluster of
+        each scan: it stands out even where the thing is too small for points in its midst.
     overlap: share of the smaller scan within TOUCHING of the other one.
     explained_share: the same, of points that are explained.
     inlier_rmse: how far touching points lie off each other's tangent planes, root mean square, own unit. It hardly
