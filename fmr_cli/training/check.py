@@ -1,6 +1,7 @@
 """What a run has gained, as its user will see it: held-out pairs through ``align``, before and after.
 
-A model by which more pairs are lost than won is not kept, nor one that calls more wrong poses ``aligned``. Where the
+A model by which more pairs are lost than won is not kept, in all or, of one kind, by more than chance (one deviation of
+a fair coin); nor is one that calls more wrong poses ``aligned``. Where the
 verdict's confidence no longer holds on these pairs, it is brought in line.
 """
 
@@ -173,11 +174,10 @@ def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
         )
     elif checked:
         said.append(f"the verdict's confidence holds on {len(checked)} held-out pairs")
-    why = ""
+    why, all_won, all_lost = "", *turned(checked)
     for name, some in groups(checked).items():
-        won = sum(c.after.right and not c.before.right for c in some)
-        lost = sum(c.before.right and not c.after.right for c in some)
-        if lost > won:
+        won, lost = turned(some)
+        if lost - won > np.sqrt(won + lost) or (lost > won and all_lost > all_won):
             why = why or f"of {name}, {lost} pairs that were right no longer are, and {won} have come to be"
     if wrong_ones(c.after for c in checked) > wrong:
         why = why or "more wrong poses are called aligned than before"
@@ -185,6 +185,12 @@ def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
         kept = model(start).weights
         return Decision(False, weights_bytes(kept), [f"not kept: {why}; {path} holds the start"])
     return Decision(True, replaced, said)
+
+
+def turned(checked: list[Checked]) -> tuple[int, int]:
+    """How many pairs were won, and how many lost."""
+    won = sum(c.after.right and not c.before.right for c in checked)
+    return won, sum(c.before.right and not c.after.right for c in checked)
 
 
 def groups(checked: list[Checked]) -> dict[str, list[Checked]]:

@@ -47,6 +47,12 @@ def test_what_loses_pairs_is_not_kept(path, kind):
     assert kind in decision.said[0]
 
 
+def test_one_made_up_pair_that_is_lost_is_chance_where_scans_win(path):
+    won = checked((False, True), (False, True), (True, True))
+    assert decide([*won, *checked((True, False), (True, True), kind="made-up scans")], path, None).kept
+    assert not decide([*won, *checked((True, False), (True, False), kind="made-up scans")], path, None).kept
+
+
 def test_a_verdict_that_is_too_sure_is_brought_in_line(path):
     before = outcome(False, -3)
     some = [Checked("held-out scans", "part", before, outcome(k % 3 > 0, 1.5)) for k in range(30)]
