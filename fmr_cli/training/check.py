@@ -1,8 +1,8 @@
 """What a run has gained, as its user will see it: held-out pairs through ``align``, before and after.
 
 A model by which more pairs are lost than won is not kept, in all or, of one kind, by more than chance (one deviation of
-a fair coin); nor is one that calls more wrong poses ``aligned``. Where the
-verdict's confidence no longer holds on these pairs, it is brought in line.
+a fair coin); nor is one that calls more wrong poses ``aligned``. Where the verdict's confidence no longer holds on
+these pairs, it is brought in line.
 """
 
 from __future__ import annotations
