@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +22,7 @@ from fmr_cli.evaluation.verdict import calibration_error
 from fmr_cli.evaluation.verdict_evidence import Judged, gather
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit
 from fmr_cli.registration.confidence import (
+    ALIGNED,
     BARE,
     CONTRADICTION,
     DETAIL,
@@ -61,6 +63,15 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     return said
 
 
+def full_looks(evidence: Sequence[Judged], confidence: np.ndarray, right: np.ndarray) -> str:
+    """How many of the poses that `align` would call aligned are wrong, where it looks as closely as it can."""
+    full = list({j.number: i for i, j in enumerate(evidence)}.values())  # the last look at each pair
+    aligned = [i for i in full if confidence[i] >= ALIGNED]
+    kinds = Counter(evidence[i].kind for i in aligned if not right[i])
+    named = "; ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    return f"full looks alone: {kinds.total()} of {len(aligned)} aligned poses are wrong ({named or 'none'})"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=1500, help=f"of scans, at least {LEAST}")
@@ -76,6 +87,7 @@ def main() -> None:
     print(f"{len(evidence)} looks at {args.pairs} pairs, each judged by weights fitted on others:")
     print(calibration_table(confidence, right))
     print(f"expected calibration error {calibration_error(confidence, right):.3f}")
+    print(full_looks(evidence, confidence, right))
     weights = fit(evidence)
     for line in bounds_in(evidence, weights):
         print(line)

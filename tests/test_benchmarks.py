@@ -107,6 +107,7 @@ def test_the_card_of_the_encoder_can_be_measured_again() -> None:
 def test_calibrate_writes_weights_in_the_form_of_the_bundled_ones(tmp_path: Path) -> None:
     said = run("benchmarks.calibrate", "--pairs", "8", "--workers", "1", "--out", str(tmp_path))
     assert "looks at 8 pairs" in said
+    assert "aligned poses are wrong" in said
     assert said.count("confidence   pairs  right") == 1
     made, bundled = (json.loads(p.read_text()) for p in (tmp_path / "verdict.json", ROOT / "models" / "verdict.json"))
     assert {name: len(values) for name, values in made.items() if name != "made by"} == {

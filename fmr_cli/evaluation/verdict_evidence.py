@@ -30,9 +30,9 @@ CHUNK = 2  # pairs handed to a worker at a time: a pair takes a second, a hand-o
 
 @dataclass(frozen=True)
 class Judged:
-    """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool; largest: (n,).
+    """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool.
 
-    kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
+    largest: (n,), ``Agreement.largest`` of each; kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
     """
 
     x: np.ndarray

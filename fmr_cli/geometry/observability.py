@@ -155,10 +155,9 @@ def pseudo_inverse(A: np.ndarray) -> np.ndarray:
 
 def about(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """The information (6, 6) of the twist about the origin as that of the twist about ``centre`` (3,)."""
-    shift = np.eye(4)
-    shift[:3, 3] = centre
-    M = adjoint(shift)
-    return M.T @ information @ M
+    T_centre_origin = np.eye(4)
+    T_centre_origin[:3, 3] = -centre
+    return in_frame(information, T_centre_origin)
 
 
 def in_frame(information: np.ndarray, T_b_a: np.ndarray) -> np.ndarray:

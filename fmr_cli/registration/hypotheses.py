@@ -42,7 +42,12 @@ class Hypothesis:
 
 def from_features(pair: Pair) -> list[Hypothesis]:
     """Matched local features and their spatial consensus: any rotation, part overlap."""
-    return [Hypothesis(T, "features", pair.overlap_score(T)) for T in agreed(pair, *pair.matches)[0]]
+    return from_matches(pair, *pair.matches)
+
+
+def from_matches(pair: Pair, x: np.ndarray, y: np.ndarray) -> list[Hypothesis]:
+    """The spatial consensus of matches of source and target points x, y (C, 3)."""
+    return [Hypothesis(T, "features", pair.overlap_score(T)) for T in agreed(pair, x, y)[0]]
 
 
 def agreed(pair: Pair, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

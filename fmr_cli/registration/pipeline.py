@@ -69,8 +69,8 @@ def align(
         return found
     fits = None
     if aligned or (hints and not options.allow_mirror):
-        pose = found.T_target_source if aligned else None
-        fits = mirror_look(source, target, options, aligned and mirror.contradicted(found), prepared, pose)
+        beside = (prepared, found.T_target_source) if aligned else None
+        fits = mirror_look(source, target, options, aligned and mirror.contradicted(found), beside)
     if aligned:
         found = mirror.weighed(found, fits)
     if found.status == "aligned":
@@ -89,25 +89,24 @@ def mirror_look(
     target: Prepared,
     options: Options,
     thorough: bool = True,
-    prepared: Prepared | None = None,
-    known: np.ndarray | None = None,
+    beside: tuple[Prepared, np.ndarray] | None = None,
 ) -> Candidate | None:
     """How the mirror image of the source fits the target, where a quick look is sure that it does.
 
     Unless thorough, fine voxels are looked at only where coarse ones make it likely: most pairs that are not aligned
-    fit in no way, mirrored or not, and the fine look is several times as dear as the coarse one. known: where a pose of
-    the source, ``prepared``, is given, what hardly overlaps beside it is not refined.
+    fit in no way, mirrored or not, and the fine look is several times as dear as the coarse one. beside: the source as
+    it is, made ready, and its T_target_source; what hardly overlaps beside that is not refined.
     """
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):
         image = mirror.image(source, options.seed)
         for detail in (FIRST, FURTHER[0]):
             judge = Judge(make_pair(image, target, options, 2, *detail))
-            score = 0.0
-            if prepared is not None and known is not None:
-                pair = make_pair(prepared, target, options, 2, *detail)
-                score = pair.overlap_score(pair.enter_centred(known))
-            consider(judge, features(judge.pair, time), time, score)
+            known = 0.0
+            if beside:
+                pair = make_pair(beside[0], target, options, 2, *detail)
+                known = pair.overlap_score(pair.enter_centred(beside[1]))
+            consider(judge, features(judge.pair, time), time, known)
             if judge.sure(SURE):
                 return judge.best
             if not (thorough or likely(judge)):

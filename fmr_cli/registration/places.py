@@ -17,7 +17,7 @@ import numpy as np
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.sampling import WITHIN
 from fmr_cli.registration.confidence import ALIGNED, Judge, among
-from fmr_cli.registration.hypotheses import Hypothesis, agreed
+from fmr_cli.registration.hypotheses import Hypothesis, from_matches
 from fmr_cli.registration.looks import FIRST, SURE, consider, features, further
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -79,8 +79,7 @@ def glance(pair: Pair, centres: list[np.ndarray], size: float) -> list[Hypothesi
         if len(inside) == 0:
             continue
         nearest = q[inside[similarity[:, inside].argmax(1)]]
-        poses = [T for T in agreed(pair, p, nearest)[0] if pair.allowed(T)]
-        found += [Hypothesis(T, "features", pair.overlap_score(T)) for T in poses]
+        found += [h for h in from_matches(pair, p, nearest) if pair.allowed(h.T_target_source)]
     return sorted(found, key=lambda h: -h.score)
 
 

@@ -108,7 +108,7 @@ class Prepared:
         def describe() -> tuple[np.ndarray, np.ndarray]:
             surface = self.surface(edge)
             index = surface.keypoints(count)
-            return surface.points[index], encoder(describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS)))
+            return surface.points[index], descriptors(surface, index, encoder)
 
         return self._described.get((edge, count, encoder.key), describe)
 
@@ -122,12 +122,9 @@ class Prepared:
             index = surface.keypoints(count, block)
             _ = surface.normals  # before the threads ask for them
 
-            def some(first: int) -> np.ndarray:
-                patches = surface.patches(index[first : first + AT_A_TIME], PATCH_RADIUS, NEIGHBOURS)
-                return encoder(describe_patches(**patches))
-
+            pieces = (index[first : first + AT_A_TIME] for first in range(0, len(index), AT_A_TIME))
             with ThreadPoolExecutor(threads) as pool:
-                found = list(pool.map(some, range(0, len(index), AT_A_TIME)))
+                found = list(pool.map(lambda piece: descriptors(surface, piece, encoder), pieces))
             return surface.points[index], np.concatenate(found)
 
         return self._described.get((edge, count, block, encoder.key), describe)
@@ -153,6 +150,11 @@ class Prepared:
             return GicpCloud(sample(self.points, count, rng) if own else self.fine(count, edge), edge, threads)
 
         return self._gicp.get((count, edge, own), make)
+
+
+def descriptors(surface: Surface, index: np.ndarray, encoder: LocalEncoder) -> np.ndarray:
+    """Of the patches about points ``index`` (K,): (K, d)."""
+    return encoder(describe_patches(**surface.patches(index, PATCH_RADIUS, NEIGHBOURS)))
 
 
 def check_systems(source: Prepared, target: Prepared) -> None:

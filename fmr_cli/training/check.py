@@ -174,9 +174,10 @@ def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
         )
     elif checked:
         said.append(f"the verdict's confidence holds on {len(checked)} held-out pairs")
-    why, all_won, all_lost = "", *turned(checked)
+    why = ""
+    all_won, all_lost = won_and_lost(checked)
     for name, some in groups(checked).items():
-        won, lost = turned(some)
+        won, lost = won_and_lost(some)
         if lost - won > np.sqrt(won + lost) or (lost > won and all_lost > all_won):
             why = why or f"of {name}, {lost} pairs that were right no longer are, and {won} have come to be"
     if wrong_ones(c.after for c in checked) > wrong:
@@ -187,7 +188,7 @@ def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
     return Decision(True, replaced, said)
 
 
-def turned(checked: list[Checked]) -> tuple[int, int]:
+def won_and_lost(checked: list[Checked]) -> tuple[int, int]:
     """How many pairs were won, and how many lost."""
     won = sum(c.after.right and not c.before.right for c in checked)
     return won, sum(c.before.right and not c.after.right for c in checked)

@@ -50,12 +50,12 @@ def test_an_image_is_found_beside_a_pose_that_fits_worse_and_not_sought_beside_a
     mirrored = PointCloud(points * [1, -1, 1])
     assert mirror_look(PointCloud(points), target, Options()) is None
     sought = len(refined)
-    assert mirror_look(PointCloud(points), target, Options(), True, prepare(PointCloud(points)), np.eye(4)) is None
+    assert mirror_look(PointCloud(points), target, Options(), True, (prepare(PointCloud(points)), np.eye(4))) is None
     assert len(refined) - sought < sought
     monkeypatch.undo()
     wrong = align(mirrored, target, hints=False)
     assert wrong.status != "aligned"
-    assert mirror_look(mirrored, target, Options(), True, prepare(mirrored), wrong.T_target_source) is not None
+    assert mirror_look(mirrored, target, Options(), True, (prepare(mirrored), wrong.T_target_source)) is not None
 
 
 def test_where_the_mirror_image_fits_better_a_pose_is_not_believed(clouds: tuple[np.ndarray, PointCloud]) -> None:

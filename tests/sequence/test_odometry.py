@@ -111,7 +111,7 @@ def test_across_a_gap_all_points_must_put_a_scan_where_the_thinned_ones_do(
     assert odometry._borne_out(scan, T_map_scan, fit) == sure
 
 
-def test_then_a_scan_that_fits_nothing_is_no_gap(at_a_gap, monkeypatch):
+def test_a_scan_across_a_gap_is_where_all_points_have_it_and_uncertain_where_they_have_it_not(at_a_gap, monkeypatch):
     odometry, scan, T_map_scan, _ = at_a_gap
     monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), T_map_scan))
     monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: Fit(T, 0.2, 1.0, name))
