@@ -46,7 +46,7 @@ from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.pipeline import align, one_blas_thread
 from fmr_cli.registration.prepared import Prepared
-from fmr_cli.registration.refinement import refined
+from fmr_cli.registration.refinement import refined, roughly
 from fmr_cli.registration.result import Stopwatch
 from fmr_cli.synthetic.pairs import scan_pair
 
@@ -197,7 +197,7 @@ def main() -> None:
             found = way(pair)
             took = time.perf_counter() - begin
             best = max(found, key=lambda h: h.score) if found else Hypothesis(np.eye(4), name)
-            degrees, shift = pose_error(np.stack([best.T_target_source, refined(pair, best)]), T)
+            degrees, shift = pose_error(np.stack([best.T_target_source, refined(pair, roughly(pair, best))]), T)
             near = (degrees < (15, 5)) & (shift < np.array([6, 2]) * pair.edge)
             outcomes[name].append((*near, took))
     print(f"{'start':16s} pairs  found  refined  median s")

@@ -76,9 +76,12 @@ class LocalEncoder:
         return digest.hexdigest()
 
     def __call__(self, patches: np.ndarray) -> np.ndarray:
-        """(K, PATCH_POINTS, CHANNELS) -> (K, 32) unit descriptors."""
-        pooled = [self.pooled(patches[i : i + CHUNK]) for i in range(0, len(patches), CHUNK)]
-        x = np.concatenate(pooled)
+        """(K, PATCH_POINTS, CHANNELS) -> (K, 32) unit descriptors, CHUNK by CHUNK: more rows change no bit of these."""
+        return np.concatenate([self.described(patches[i : i + CHUNK]) for i in range(0, len(patches), CHUNK)])
+
+    def described(self, patches: np.ndarray) -> np.ndarray:
+        """The descriptors of a few patches."""
+        x = self.pooled(patches)
         for weight, bias in self.head[:-1]:
             x = np.maximum(x @ weight.T + bias, 0)
         weight, bias = self.head[-1]

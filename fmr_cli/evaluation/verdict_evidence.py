@@ -15,7 +15,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration.confidence import Judge
-from fmr_cli.registration.looks import FIRST, consider, features, further
+from fmr_cli.registration.looks import CLOSER, FIRST, coarse_look, further
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.pipeline import one_blas_thread
@@ -44,14 +44,14 @@ class Judged:
 
 
 def gather(pairs: int, seed: int, workers: int | None = None) -> list[Judged]:
-    """The evidence of ``pairs`` fresh pairs, two looks each, the same whatever the number of workers."""
+    """The evidence of ``pairs`` fresh pairs, three looks each, the same whatever the number of workers."""
     with ProcessPoolExecutor(workers or usable_cores(), mp_context=multiprocessing.get_context("spawn")) as pool:
         found = pool.map(pair_evidence, [(seed, number) for number in range(pairs)], chunksize=CHUNK)
         return [judged for looks in found for judged in looks]
 
 
 def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
-    """What a first look and a full one find at the pair ``seed`` = (run, number).
+    """What each look finds at the pair ``seed`` = (run, number).
 
     Of degenerate pairs no pose is right and all fit: they are told by what is not determined, and give no evidence.
     """
@@ -63,7 +63,7 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
     try:
         with one_blas_thread():
             source, target = Prepared(PointCloud(pair.source)), Prepared(PointCloud(pair.target))
-            for judge in both_looks(source, target):
+            for judge in all_looks(source, target):
                 poses = [judge.pair.leave_centred(c.T_target_source) for c in judge.candidates]
                 right = [bool(truth) and pair.of(truth).is_right(T, RIGHT_DEGREES, RIGHT_SHARE) for T in poses]
                 x = np.array([c.evidence.vector() for c in judge.candidates])
@@ -75,9 +75,9 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
     return found
 
 
-def both_looks(source: Prepared, target: Prepared) -> list[Judge]:
-    """What ``align`` would judge on coarse voxels, and on all others, had the coarse ones not been enough."""
+def all_looks(source: Prepared, target: Prepared) -> list[Judge]:
+    """What ``align`` would judge at each look, had the one before not been enough; those on other voxels are one."""
     time = Stopwatch()
-    first = Judge(make_pair(source, target, Options(), 1, *FIRST))
-    consider(first, features(first.pair, time), time)
-    return [first, further(source, target, Options(), 1, time, enough=2.0)]
+    first = coarse_look(make_pair(source, target, Options(), 1, *FIRST), time)
+    closer = coarse_look(make_pair(source, target, Options(), 1, *CLOSER), time, first)
+    return [first, closer, further(source, target, Options(), 1, time, enough=2.0, former=closer)]

@@ -6,6 +6,7 @@ length here by it and changes nothing else.
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +16,7 @@ from fmr_cli.geometry.normals import neighbours, normals_and_variation
 from fmr_cli.geometry.voxels import voxel_downsample, voxel_keys
 
 BORDER = 1e-3  # surface variation that a lean of 1 counts as: below any bend, above the rounding of a plane
+MIRRORED = np.array([-1.0, 1.0, 1.0])  # what the mirror x = 0 makes of coordinates; any plane would do
 SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
 
 
@@ -58,6 +60,15 @@ class Surface:
             off.append(np.abs(np.einsum("ni,ni->n", p[there] - p, n)))
             cosine.append(np.abs(np.einsum("ni,ni->n", n[there], n)))
         return np.mean(off, axis=0), 1 - np.mean(cosine, axis=0)
+
+    def mirrored(self) -> Surface:
+        """The same surface in the mirror x = 0 of its own frame; what is known of its neighbourhoods stays."""
+        image = copy(self)
+        image.points = self.points * MIRRORED
+        image.tree = cKDTree(image.points)
+        normals, *others = self._shape
+        image.__dict__["_shape"] = (normals * MIRRORED, *others)
+        return image
 
     def keypoints(self, count: int, block: float | None = None) -> np.ndarray:
         """Indices of the points of highest surface variation, at most one in a cell of two voxels, at most ``count``.

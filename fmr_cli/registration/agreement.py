@@ -74,8 +74,12 @@ class Agreement:
 
 
 def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> Agreement:
-    """Compare two surfaces on the same voxel edge at a pose between their frames."""
-    shares, explained_shares, sums, detail, missing, largest = [], [], np.zeros(7), 0.0, 0, 0
+    """Compare two surfaces on the same voxel edge at a pose between their frames.
+
+    Of a pose that is more contradicted than explained, which the verdict denies whatever else there is, no cluster is
+    sought: all that contradicts it counts as missing, in one thing, and nothing as detail.
+    """
+    shares, explained_shares, sums, seen = [], [], np.zeros(7), []
     for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
         moved = transform_points(T, a.points)
         distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
@@ -97,13 +101,17 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
             explained.sum(), contradicted.sum(), touching.sum(), (off[touching] ** 2).sum(),
             (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
         ]  # fmt: skip
-        judged = explained | contradicted
-        missing += amid_their_like(moved[here[judged]], contradicted[judged], LIKE_REACH * b.edge)
-        largest += largest_cluster(moved[here[contradicted]], ONE_THING * b.edge)
-        common, rng = here[explained], np.random.default_rng(0)
-        detail += len(common) * share_beyond_corner(moved[common], n[explained], b.edge, rng)
+        seen.append((moved[here], n, explained, contradicted))
         shares.append(touching.sum() / max(a.solid.sum(), 1))
         explained_shares.append(explained.sum() / max(a.solid.sum(), 1))
+    denied, detail = sums[1] > sums[0], 0.0
+    missing = largest = int(sums[1]) if denied else 0
+    for x, n, explained, contradicted in [] if denied else seen:
+        judged = explained | contradicted
+        missing += amid_their_like(x[judged], contradicted[judged], LIKE_REACH * target.edge)
+        largest += largest_cluster(x[contradicted], ONE_THING * target.edge)
+        common = share_beyond_corner(x[explained], n[explained], target.edge, np.random.default_rng(0))
+        detail += explained.sum() * common
     off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
     return Agreement(
         explained=int(sums[0]),

@@ -18,37 +18,78 @@ from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Stopwatch
 
-REFINED = 8  # hypotheses that are refined and judged, of each look
-WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined
+REFINED = 8  # hypotheses that are refined, of each look
+PROMISING = 0.4  # of the best overlap score of a look, that a hypothesis has at least as it is found
+# Of the best overlap score among a look's rough poses and what is known, that a rough pose has at least to be judged.
+WORTH = 0.55
+AGAIN = 3  # poses of a look, the best ones, that the next one judges on its own voxels
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
-FIRST = (1.5, 250)  # a first look: the voxel edge, times the one that suits, and keypoints; it is often sure already
-# The looks after it, while none is sure; the coarsest for LiDAR scans far apart in a street, whose rings lie far apart.
-FURTHER = ((1.0, 1000), (1.4, 1000), (0.7, 1000), (2.8, 1000))
+# A look: the voxel edge, times the one that suits, and keypoints. The first one is often sure already; the second one
+# has its voxels and what is described on them, and is most often sure of what the first one is not.
+FIRST, CLOSER = (1.5, 250), (1.5, 1000)
+# The looks after them; the coarsest for LiDAR scans far apart in a street, whose rings lie far apart.
+FURTHER = ((1.0, 1000), (0.7, 1000), (2.8, 1000))
 COARSE = 2.0  # from which a look's poses are too rough to be refined on the voxels that they are judged on
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 
 log = logging.getLogger(__name__)
 
 
-def at_once(source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch) -> Judge:
-    """Looks at all of the target, dearer ones while none is sure."""
+def at_once(
+    source: Prepared,
+    target: Prepared,
+    options: Options,
+    threads: int,
+    time: Stopwatch,
+    first: Judge | None = None,
+) -> Judge:
+    """Looks at all of the target, dearer ones while none is sure. first: what a first look has found already."""
+    judge = first
     if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None:
-        with suppress(RegistrationError):  # too few voxels of that size
-            judge = Judge(make_pair(source, target, options, threads, *FIRST))
-            consider(judge, features(judge.pair, time), time)
-            if judge.sure(SURE):
-                return judge
-    return further(source, target, options, threads, time)
+        for detail in (CLOSER,) if first else (FIRST, CLOSER):
+            with suppress(RegistrationError):  # too few voxels of that size
+                judge = coarse_look(make_pair(source, target, options, threads, *detail), time, judge)
+                if judge.sure(SURE):
+                    return judge
+    return further(source, target, options, threads, time, former=judge)
+
+
+def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None) -> Judge:
+    """What is found on a pair's voxels, and what is left there of the poses that a former look has found."""
+    judge, found = Judge(pair), features(pair, time)
+    look_again(judge, former, time)
+    consider(judge, found, time)
+    return judge
+
+
+def look_again(judge: Judge, former: Judge | None, time: Stopwatch) -> None:
+    """Judge the best poses that a former look has found."""
+    known = former.candidates[:AGAIN] if former else []
+    if known:
+        with time.stage("describe"):
+            judge.pair.describe()
+    with time.stage("refine"):
+        judge_worthy(judge, [h for c in known for h in hypotheses.from_pose(judge.pair, c.T_target_source, c.start)])
 
 
 def further(
-    source: Prepared, target: Prepared, options: Options, threads: int, time: Stopwatch, enough: float = SURE
+    source: Prepared,
+    target: Prepared,
+    options: Options,
+    threads: int,
+    time: Stopwatch,
+    enough: float = SURE,
+    former: Judge | None = None,
 ) -> Judge:
-    """What fine voxels, more places and other scales find, until a pose has ``enough`` confidence."""
+    """What fine voxels, more places and other scales find, until a pose has ``enough`` confidence.
+
+    former: what a look on coarse voxels has found.
+    """
     judge = Judge(make_pair(source, target, options, threads, *FURTHER[0]))
     pair = judge.pair
     if not isinstance(options.init, str) or options.init in ("identity", "centroid"):
         return from_given(judge, options.init, time)
+    look_again(judge, former, time)
     if options.init != "search":
         for coarseness, keypoints in FURTHER:
             with suppress(RegistrationError):
@@ -56,7 +97,8 @@ def further(
                 found = features(seen, time)
                 if coarseness >= COARSE:
                     with time.stage("refine"):
-                        found = [replace(h, T_target_source=refinement.refined(seen, h)) for h in found]
+                        rough = [refinement.roughly(seen, h) for h in found]
+                        found = [replace(h, T_target_source=refinement.refined(seen, h)) for h in rough]
                 consider(judge, found, time)
             if judge.sure(enough):
                 return judge
@@ -97,32 +139,33 @@ def features(pair: Pair, time: Stopwatch) -> list[Hypothesis]:
 def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch, known: float = 0.0) -> None:
     """Refine and judge the hypotheses that are worth it, best first, and the rivals of what then is likely.
 
-    known: the overlap score of a pose that is known already, if any: what has little beside it is not worth it.
+    known: the overlap score of a pose that is known otherwise, if any: what has little beside it is not worth it.
     """
     pair = judge.pair
     with time.stage("refine"):
         ranked = sorted((h for h in found if pair.allowed(h.T_target_source)), key=lambda h: -h.score)
-        for hypothesis in ranked[:REFINED]:
-            worth = WORTH * max(ranked[0].score, known)
-            if hypothesis.score >= worth and not judge.knows(hypothesis.T_target_source):
-                judge_refined(judge, hypothesis)
+        judge_worthy(judge, [h for h in ranked[:REFINED] if h.score >= PROMISING * ranked[0].score], known)
     with time.stage("rivals"):
         # What is not likely has no need of rivals; those of a pose that a former look has found are known.
         if likely(judge) and not np.array_equal(judge.rivals_of, judge.best.T_target_source):
             judge.rivals_of = judge.best.T_target_source
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
-            for hypothesis in rivals:
-                if not judge.knows(hypothesis.T_target_source):
-                    judge_refined(judge, hypothesis)
+            judge_worthy(judge, rivals)
 
 
-def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
-    """Judge the pose that a hypothesis leads to, if the options allow it."""
-    T = refinement.refined(judge.pair, hypothesis)
-    if judge.pair.allowed(T):
-        judge.consider(T, hypothesis.start, hypothesis.errors)
-        log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
+def judge_worthy(judge: Judge, found: list[Hypothesis], known: float = 0.0) -> None:
+    """Judge the poses that hypotheses lead to, those whose rough poses overlap little beside the best one left out."""
+    pair = judge.pair
+    rough = sorted((refinement.roughly(pair, h) for h in found), key=lambda h: -h.score)
+    best = [pair.overlap_score(judge.best.T_target_source)] if judge.candidates else []
+    worth = WORTH * max([known, *best, *(h.score for h in rough[:1])])
+    for hypothesis in rough:
+        if hypothesis.score >= worth and not judge.knows(hypothesis.T_target_source):
+            T = refinement.refined(pair, hypothesis)
+            if pair.allowed(T) and not judge.knows(T):
+                judge.consider(T, hypothesis.start, hypothesis.errors)
+                log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
 
 
 def likely(judge: Judge) -> bool:

@@ -16,7 +16,11 @@ class Memo:
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """The value of the key, made where it is not there. Two threads may make the same value at once: they agree."""
-        value = self.kept[key] if key in self.kept else make()
+        return self.renew(key, lambda known: make() if known is None else known)
+
+    def renew(self, key: Hashable, make: Callable[[Any], Any]) -> Any:
+        """The value that ``make`` makes of the one that is there, or of None."""
+        value = make(self.kept.get(key))
         self.kept[key] = value
         self.kept.move_to_end(key)
         while len(self.kept) > self.size:

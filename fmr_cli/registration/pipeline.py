@@ -19,7 +19,7 @@ from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, mirror, places, refinement
 from fmr_cli.registration.confidence import LIKELY, Candidate, Judge
-from fmr_cli.registration.looks import FIRST, FURTHER, SURE, at_once, consider, features, likely
+from fmr_cli.registration.looks import CLOSER, FIRST, SURE, at_once, consider, features, likely
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared, check_systems
@@ -69,14 +69,13 @@ def align(
         return found
     fits = None
     if aligned or (hints and not options.allow_mirror):
-        beside = (prepared, found.T_target_source) if aligned else None
-        fits = mirror_look(source, target, options, aligned and mirror.contradicted(found), beside)
+        fits = mirror_look(prepared, target, options, threads, found if aligned else None)
     if aligned:
         found = mirror.weighed(found, fits)
     if found.status == "aligned":
         return found
     if options.allow_mirror:
-        image = mirror.image(source, options.seed)
+        image = prepared.mirrored()
         other = as_they_are(image, target, options, threads, check, Stopwatch())
         return mirror.undone(other, image.centre) if other.status == "aligned" else found
     if fits and hints:
@@ -85,31 +84,25 @@ def align(
 
 
 def mirror_look(
-    source: PointCloud | Prepared,
-    target: Prepared,
-    options: Options,
-    thorough: bool = True,
-    beside: tuple[Prepared, np.ndarray] | None = None,
+    source: Prepared, target: Prepared, options: Options, threads: int = 1, beside: Registration | None = None
 ) -> Candidate | None:
     """How the mirror image of the source fits the target, where a quick look is sure that it does.
 
-    Unless thorough, fine voxels are looked at only where coarse ones make it likely: most pairs that are not aligned
-    fit in no way, mirrored or not, and the fine look is several times as dear as the coarse one. beside: the source as
-    it is, made ready, and its T_target_source; what hardly overlaps beside that is not refined.
+    Closer only where a first look makes it likely: most pairs fit in no way but one, and a closer look is several times
+    as dear. beside: a pose of the source as it is that is ``aligned``; what hardly overlaps beside it is not judged.
     """
     time = Stopwatch()
     with one_blas_thread(), suppress(RegistrationError):
-        image = mirror.image(source, options.seed)
-        for detail in (FIRST, FURTHER[0]):
-            judge = Judge(make_pair(image, target, options, 2, *detail))
-            known = 0.0
+        image = source.mirrored()
+        for detail in FIRST, CLOSER:
+            judge, known = Judge(make_pair(image, target, options, threads, *detail)), 0.0
             if beside:
-                pair = make_pair(beside[0], target, options, 2, *detail)
-                known = pair.overlap_score(pair.enter_centred(beside[1]))
+                pair = make_pair(source, target, options, threads, *detail)
+                known = pair.overlap_score(pair.enter_centred(beside.T_target_source))
             consider(judge, features(judge.pair, time), time, known)
             if judge.sure(SURE):
                 return judge.best
-            if not (thorough or likely(judge)):
+            if not likely(judge):
                 return None
     return None
 

@@ -18,7 +18,7 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.sampling import WITHIN
 from fmr_cli.registration.confidence import ALIGNED, Judge, among
 from fmr_cli.registration.hypotheses import Hypothesis, from_matches
-from fmr_cli.registration.looks import FIRST, SURE, consider, features, further
+from fmr_cli.registration.looks import FIRST, SURE, at_once, consider, features
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS, Prepared
@@ -110,7 +110,7 @@ def look(source: Prepared, target: Prepared, options: Options, threads: int, tim
     judges = sorted((j for j in judges if j.candidates), key=lambda j: -j.best.confidence)
     for number, judge in enumerate(judges[:CLOSER]):
         if not judge.sure(SURE):
-            judges[number] = further(source, judge.pair.target, options, threads, time)
+            judges[number] = at_once(source, judge.pair.target, options, threads, time, judge)
         if judges[number].sure(ALIGNED):
             break
     if not judges:

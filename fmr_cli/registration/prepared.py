@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
-from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
+from fmr_cli.descriptors.patch_encoder import CHUNK, NEIGHBOURS, PATCH_RADIUS, LocalEncoder, describe_patches
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.frames import Frame
 from fmr_cli.geometry.gicp import GicpCloud
@@ -16,7 +17,7 @@ from fmr_cli.geometry.planar import plane_of, raised
 from fmr_cli.geometry.sampling import distinct, reach, sample, thinned, working_scale
 from fmr_cli.geometry.smoothing import Roughness, roughness
 from fmr_cli.geometry.strays import Strays, strays
-from fmr_cli.geometry.surface import Surface
+from fmr_cli.geometry.surface import MIRRORED, Surface
 from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.io.crs import code_of, in_degrees, name_of, same
 from fmr_cli.registration.memo import Memo
@@ -27,6 +28,15 @@ SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxe
 LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
 AT_A_TIME = 1000  # patches of a map: 100 MB
 KEPT = 6  # results of each kind that a cloud keeps: the grids and features of one pair, for its next pair
+
+
+@dataclass(frozen=True)
+class Described:
+    """The first ``asked`` keypoints of a surface, or fewer where it has fewer: (K, 3), and their descriptors (K, d)."""
+
+    asked: int
+    keypoints: np.ndarray
+    descriptors: np.ndarray
 
 
 class Prepared:
@@ -73,6 +83,11 @@ class Prepared:
         self.points = points
         self.edge, self.spacing = working_scale(points, rng)
         self.reach = reach(points, np.random.default_rng(self.seed))
+        self._seen_in_mirror: Prepared | None = None  # whose voxels these are, if it is an image
+        self._forget()
+
+    def _forget(self) -> None:
+        """What is computed from the points, for each kind of it: nothing yet."""
         self._surfaces, self._described, self._fine, self._gicp, self._roughness = (Memo(KEPT) for _ in range(5))
 
     @property
@@ -98,19 +113,45 @@ class Prepared:
         origin = None if self.sensor_origin is None else self.sensor_origin * factor
         return Prepared(PointCloud(self.frame.leave(self.points) * factor, sensor_origin=origin), self.seed)
 
+    def mirrored(self) -> Prepared:
+        """The same cloud in the mirror x = 0 of the file's coordinates, on the same voxels."""
+        image = copy(self)
+        image.frame = Frame(self.frame.origin * MIRRORED)
+        image.points = self.points * MIRRORED
+        image.plane = None if self.plane is None else self.plane * MIRRORED
+        image.sensor_origin = None if self.sensor_origin is None else self.sensor_origin * MIRRORED
+        image._forget()
+        image._seen_in_mirror = self
+        return image
+
     def surface(self, edge: float) -> Surface:
         """The centred cloud on a voxel grid of ``edge``."""
-        return self._surfaces.get(edge, lambda: Surface(self.points, edge))
+
+        def make() -> Surface:
+            own = self._seen_in_mirror
+            return own.surface(edge).mirrored() if own else Surface(self.points, edge)
+
+        return self._surfaces.get(edge, make)
 
     def described(self, edge: float, count: int, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
-        """At most ``count`` keypoints (K, 3), centred, and their descriptors (K, d)."""
+        """At most ``count`` keypoints (K, 3), centred, and their descriptors (K, d).
 
-        def describe() -> tuple[np.ndarray, np.ndarray]:
+        Of more than a look before asked for, only what is new is described.
+        """
+
+        def describe(begun: Described | None) -> Described:
+            if begun and begun.asked >= count:
+                return begun
+            asked = -(-count // CHUNK) * CHUNK
             surface = self.surface(edge)
-            index = surface.keypoints(count)
-            return surface.points[index], descriptors(surface, index, encoder)
+            index, parts = surface.keypoints(asked), [begun.descriptors] if begun else []
+            new = index[len(parts[0]) if begun else 0 :]
+            if len(new):
+                parts.append(descriptors(surface, new, encoder))
+            return Described(asked, surface.points[index], np.concatenate(parts))
 
-        return self._described.get((edge, count, encoder.key), describe)
+        found = self._described.renew((edge, encoder.key), describe)
+        return found.keypoints[:count], found.descriptors[:count]
 
     def described_evenly(
         self, edge: float, count: int, block: float, encoder: LocalEncoder, threads: int = 1

@@ -5,6 +5,8 @@ Poses are between the centred frames of a ``Pair``.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -25,8 +27,10 @@ from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS
 LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; GICP does the rest
 FINE = LEVELS[1:]
 PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, IC iterations, points of a patch
-PLANE_REACHES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.0, 1.0, 0.7, 0.7)  # voxel edges, a step each
-PLANE_POINTS, CHOSEN_ANEW = 800, 5  # of the common region, chosen anew every so many steps
+# Voxel edges, a step each: first on a few points from anywhere, which tells most hypotheses that lead nowhere; then on
+# more of the common region.
+ROUGH_REACHES, ROUGH_POINTS = (4.0, 3.0, 2.0, 1.5), 400
+FINE_REACHES, PLANE_POINTS = (2.0, 1.5, 1.0, 1.0, 0.7, 0.7), 800
 COMMON_REACH = 4.0  # voxel edges: points nearer than that to the other surface may be of the common region
 DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
@@ -40,14 +44,21 @@ FINER = 4.0  # times the grid of the last step on large clouds, where they are d
 COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
 
 
-def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
-    """The pose that a hypothesis leads to, near enough to be judged; cheap, so that many can be."""
+def roughly(pair: Pair, hypothesis: Hypothesis) -> Hypothesis:
+    """Where a hypothesis leads to, near enough to tell by its score whether it is worth more: cheap."""
     T = pair.motion.exact(hypothesis.T_target_source)
     if hypothesis.errors:  # where the global feature leads to is only roughly right
         T = by_patches(pair, T, LEVELS)
+    if pair.options.refine:
+        T = by_few_planes(pair, T)
+    return replace(hypothesis, T_target_source=T, score=pair.overlap_score(T))
+
+
+def refined(pair: Pair, rough: Hypothesis) -> np.ndarray:
+    """The pose that a hypothesis leads to after ``roughly``, near enough to be judged."""
     if not pair.options.refine:
-        return T if hypothesis.errors else by_patches(pair, T, FINE)
-    return by_planes(pair, T)
+        return rough.T_target_source if rough.errors else by_patches(pair, rough.T_target_source, FINE)
+    return by_common_planes(pair, rough.T_target_source)
 
 
 def by_patches(
@@ -86,19 +97,33 @@ def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
 
 
 def by_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
-    """The pose after robust point-to-plane steps on a few voxels, from far to near: what a hypothesis is judged at.
+    """The pose after robust point-to-plane steps on a few voxels, from far to near: what a hypothesis is judged at."""
+    return by_common_planes(pair, by_few_planes(pair, T_target_source))
 
-    Only points of the common region, and partners that face along, so that at small overlap what only one scan saw
-    does not pull the pose away.
+
+def by_few_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+    """The pose after a few steps on few points."""
+    points, facing = (x[:ROUGH_POINTS] for x in pair.some)  # in random order
+    return by_steps(pair, T_target_source, points, facing, ROUGH_REACHES)
+
+
+def by_common_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+    """The pose after steps on the common region, so that at small overlap what only one scan saw does not pull."""
+    return by_steps(pair, T_target_source, *common_points(pair, T_target_source), FINE_REACHES)
+
+
+def by_steps(
+    pair: Pair, T_target_source: np.ndarray, points: np.ndarray, facing: np.ndarray, reaches: tuple[float, ...]
+) -> np.ndarray:
+    """The pose after a robust point-to-plane step of points, normals (N, 3) of the source for each reach, voxel edges.
+
+    Onto partners that face along.
     """
     scale = pair.options.scale
     basis, T, pivot = with_scale(pair.motion.basis(), scale), T_target_source, np.zeros(3)
     free = len(basis)
-    for number, reach in enumerate(PLANE_REACHES):
-        if number % CHOSEN_ANEW == 0:
-            points, facing = common_points(pair, T)
-        reach *= pair.edge
-        normal = point_to_plane(points, pair.t.points, pair.t.normals, pair.t.tree, T, reach, pivot, facing)
+    for reach in reaches:
+        normal = point_to_plane(points, pair.t.points, pair.t.normals, pair.t.tree, T, reach * pair.edge, pivot, facing)
         if normal.count < MIN_POINTS:
             return T
         A, b = normal.A[:free, :free], normal.b[:free]

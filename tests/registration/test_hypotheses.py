@@ -7,7 +7,7 @@ import pytest
 
 from fmr_cli import PointCloud
 from fmr_cli.cloud import angle_degrees
-from fmr_cli.registration import looks
+from fmr_cli.registration import looks, refinement
 from fmr_cli.registration.confidence import Judge
 from fmr_cli.registration.hypotheses import Hypothesis, rivals
 from fmr_cli.registration.options import Options
@@ -84,13 +84,14 @@ def test_rivals_of_a_pose_are_sought_once(monkeypatch: pytest.MonkeyPatch) -> No
     assert [c.confidence for c in judge.candidates] == [c.confidence for c in before]
 
 
-def test_what_hardly_overlaps_beside_a_known_pose_is_not_refined() -> None:
+def test_what_hardly_overlaps_beside_a_known_pose_is_not_judged() -> None:
     points = box_like()
     pair = make_pair(Prepared(PointCloud(points[::2])), Prepared(PointCloud(points[1::2])), Options())
     far, judge = np.eye(4), Judge(pair)
     far[:3, 3] = [1.0, 0.7, 0.4]
     poor = Hypothesis(far, "features", pair.overlap_score(far))
-    looks.consider(judge, [poor], Stopwatch(), known=3 * poor.score)
+    leads_to = refinement.roughly(pair, poor).score
+    looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.54)
     assert judge.candidates == []
-    looks.consider(judge, [poor], Stopwatch(), known=2 * poor.score)
+    looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.56)
     assert len(judge.candidates) == 1
