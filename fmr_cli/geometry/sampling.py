@@ -16,24 +16,22 @@ OBLIQUE = 0.5377, 0.3183, 0.7809  # a line that no usual grid is square to
 
 
 def distinct(points: np.ndarray) -> np.ndarray:
-    """The points without exact repetitions, of each the first: (N, 3) -> (M, 3), M <= N.
+    """The points without exact repetitions, of each the first, in their order: (N, 3) -> (M, 3), M <= N.
 
-    Sorted by their distance along one oblique line, where equal points meet. Different points may meet too, as on a
-    grid: they are told apart by their coordinates. np.unique of whole rows takes two to five times as long (measured on
-    a million points).
+    Equal points meet in their distance along one oblique line, and hardly any others do: only those that meet are
+    compared. Of a million points of which none are equal that takes a tenth of the time of sorting them.
     """
     x, y, z = points.T
     along = x * OBLIQUE[0] + y * OBLIQUE[1] + z * OBLIQUE[2]  # term by term: equal points to equal bits
-    order = np.argsort(along, kind="stable")
-    same = np.diff(along[order]) == 0
-    differ = (np.diff(points[order], axis=0) != 0).any(1)
-    if (same & differ).any():
-        run = np.concatenate([[0], np.cumsum(~same)])  # of points that meet
-        mixed = np.isin(run, run[1:][same & differ])
-        some = order[mixed]
-        order[mixed] = some[np.lexsort((some, *points[some].T, run[mixed]))]
-        differ = (np.diff(points[order], axis=0) != 0).any(1)
-    return points[order[np.concatenate([[True], ~same | differ])[: len(points)]]]
+    ordered = np.sort(along)
+    met = ordered[1:][np.diff(ordered) == 0]
+    if not len(met):
+        return points
+    some = np.flatnonzero(met[np.searchsorted(met, along).clip(max=len(met) - 1)] == along)
+    order = some[np.lexsort((some, *points[some].T))]
+    keep = np.ones(len(points), bool)
+    keep[order[1:][(np.diff(points[order], axis=0) == 0).all(1)]] = False
+    return points[keep]
 
 
 def thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -51,9 +51,10 @@ class Prepared:
     def __init__(self, cloud: PointCloud, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         points = thinned(cloud.points, AT_MOST, rng)
-        points = points[np.isfinite(points).all(1)]
+        if not np.isfinite(points.sum()):  # cheap, and hardly any cloud has others
+            points = points[np.isfinite(points).all(1)]
         found = strays(points, np.random.default_rng(seed)) if len(points) else Strays(np.ones(0, bool), {})
-        points = points[found.keep]
+        points = points if found.keep.all() else points[found.keep]
         self.notes = [f"{cloud.name}: {note}" for note in cloud.notes]
         self.notes += [
             f"{cloud.name}: {n} {f'points {why} are' if n > 1 else f'point {why} is'} no surface, set aside"
