@@ -102,7 +102,9 @@ def describe(
     rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
     points = smaller(pair, best.T_target_source)
     centre = points.mean(0)
-    weak = observability.undetermined(observability.about(certain.information, centre), points - centre, in_use(pair))
+    twists = observability.weak_twists(observability.about(certain.information, centre), points - centre, in_use(pair))
+    twists = observability.unopposed(twists, pair.s, pair.t, best.T_target_source, centre)
+    weak = observability.in_words(twists)
     aligned = best.confidence >= ALIGNED and not weak
     reasons = [f"the scans do not determine: {'; '.join(weak)}"] if weak else []
     alternatives = [
