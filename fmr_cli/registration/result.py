@@ -96,7 +96,7 @@ def describe(
     """
     T = pair.leave_centred(best.T_target_source)
     T[:3, :3] *= factor
-    noise = [cloud.deviation for cloud in roughnesses(pair)]
+    noise = [cloud.noise for cloud in roughnesses(pair)]
     eyes = (pair.source.eye, pair.target.eye)
     certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3), noise, eyes)
     rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
