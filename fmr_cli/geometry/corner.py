@@ -14,7 +14,9 @@ PLANES = 3
 POINTS, SEEDS = 1000, 60  # points that are looked at, and those of them whose tangent planes are tried
 ALONG = 0.85  # |cosine| between a point's normal and its plane's: noise turns normals by 20 deg, 30 deg are a bend
 OFF = 1.5  # voxel edges that a point of a plane may lie off at most: beside an edge, voxels average both sides
-LEAST_OFF, SIGMAS = 0.5, 4.0  # at least, and times the plane's own scatter: a window's recess is no noise of its wall
+# At least, and times the scatter of the layer of twice that width that most of the plane's points lie in: neither the
+# noise of a wall nor its windows' recess, which is none.
+LEAST_OFF, SIGMAS = 0.5, 4.0
 ACROSS = 0.5  # of a normal, the least share outside the span of the former planes': parallel planes make no corner
 
 
@@ -45,9 +47,19 @@ def plane(points: np.ndarray, normals: np.ndarray, about: np.ndarray, edge: floa
     for _ in range(2):  # the second time without what stands out from it
         middle = points[about].mean(0)
         normal = np.linalg.eigh((points[about] - middle).T @ (points[about] - middle))[1][:, 0]
-        off = np.abs((points - middle) @ normal)
-        alike = (off < OFF * edge) & (np.abs(normals @ normal) > ALONG)
-        sigma = NORMAL * np.median(off[alike]) if alike.any() else 0.0
-        on = off < np.clip(SIGMAS * sigma, LEAST_OFF * edge, OFF * edge)
+        height = (points - middle) @ normal
+        alike = (np.abs(height) < OFF * edge) & (np.abs(normals @ normal) > ALONG)
+        layer = thickest(height[alike], 2 * LEAST_OFF * edge)
+        level = float(np.median(layer)) if len(layer) else 0.0
+        sigma = NORMAL * float(np.median(np.abs(layer - level))) if len(layer) else 0.0
+        on = np.abs(height - level) < np.clip(SIGMAS * sigma, LEAST_OFF * edge, OFF * edge)
         about = alike & on if (alike & on).sum() >= PLANES else about
     return normal, on
+
+
+def thickest(heights: np.ndarray, width: float) -> np.ndarray:
+    """Those of heights (N,) in the window of ``width`` that has most: of a wall and its windows, the wall."""
+    heights = np.sort(heights)
+    counts = np.searchsorted(heights, heights + width, side="right") - np.arange(len(heights))
+    first = int(counts.argmax()) if len(heights) else 0
+    return heights[first : first + int(counts.max(initial=0))]

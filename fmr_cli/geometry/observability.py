@@ -19,12 +19,18 @@ WEAK = 2e-3  # of the strongest direction's information: what the noise of the n
 # The same of a whole pair, for how far a direction moves the scan: of spheres, cylinders and corridors of 2,000 points
 # and more up to 0.0045, of right pairs of the street of `python -m benchmarks.multiway` from 0.010.
 HARDLY = 5e-3
+# But for what surfaces oppose (``unopposed``): a direction that as many voxels of both scans face, by more than SURELY
+# deviations of what the normals' errors would say, is determined, however many others say nothing. On made-up pairs up
+# to 2 voxels along tunnels and walls, about spheres and bottles; along facades and corridors, by the sides of their
+# windows and doors, 7 to 230.
+OPPOSED, SURELY = 5.0, 3.0
 REACH = 1.5  # voxel edges: correspondences further apart are no observations
 BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated, those of two blocks not
 BENDS = 8.0  # independent parts of a scan that is bent or drifted as a whole: half an extent each
 # Counted as left of a direction without a block: without the one block that alone holds it, nothing would be.
 LEFT = 1e-3
 BIAS = 1.0  # points' sigmas: of a range bias, beforehand; sensors' data sheets give accuracy and noise of one size
+EXPECTED = 6.0  # of the squared distance between a pose and another estimate of it, in deviations: one a direction
 LEAST_BLOCKS = 8  # fewer say nothing about the scatter of their sums
 
 
@@ -57,9 +63,11 @@ def certainty(
     The covariance is that of a robust estimate of correlated observations (Huber's sandwich, by blocks: Liang and Zeger
     1986). With the pull ψ = w r of a residual and its slope ψ' by r, D = Σ ψ' J Jᵀ and g_b = Σ ψ J over block b of
     neighbouring voxels, it is D⁻¹ (Σ g_b g_bᵀ) D⁻¹, however the residuals within a block hang together, be it by noise
-    that voxels share or by a surface that is bent. Each g_b is divided by what the block itself leaves of it
-    (I - D_b D⁻¹: the jackknife), since the pose follows a block that alone holds a direction. Where the residuals' own
-    optimum lies further from the pose than this covariance allows, it grows to what allows it (Birge's ratio). A misfit
+    that voxels share or by a surface that is bent. Each g_b is divided by the root of what the block itself leaves of
+    its square (I - D_b D⁻¹), since the pose follows a block that alone holds a direction: without bias where the
+    residuals are of one size (Bell and McCaffrey 2002), while the jackknife, without the root, has 1.1 times the
+    variance on made-up scans. Where the residuals' own optimum lies further from the pose than this covariance allows,
+    the step to it counts as a deviation along its own direction, and the others are none the worse for it. A misfit
     beyond the surfaces' own roughness, as of scans that are bent or drifted, is the same over large parts, of which
     there are BENDS.
     """
@@ -143,9 +151,14 @@ def sandwich(J: np.ndarray, pull: np.ndarray, slope: np.ndarray, block: np.ndarr
     g_b = np.stack([np.bincount(block, row, count) for row in J * pull], 1)
     inverse = pseudo_inverse(D_b.sum(0))
     step = inverse @ g_b.sum(0)
-    g_b = np.linalg.solve((1 + LEFT) * np.eye(6) - D_b @ inverse, (g_b - D_b @ step)[..., None])[..., 0]
-    found = inverse @ (g_b.T @ g_b) @ inverse * (count - 1) / count
-    return found * max(float(step @ pseudo_inverse(found) @ step) / 6, 1.0)
+    values, axes = np.linalg.eigh(inverse)
+    half = (axes * np.sqrt(np.maximum(values, 0))) @ axes.T  # D^-1/2, in whose units what a block leaves is symmetric
+    left, axes = np.linalg.eigh((1 + LEFT) * np.eye(6) - half @ D_b @ half)
+    along = np.einsum("bji,bj->bi", axes, (g_b - D_b @ step) @ half) / np.sqrt(np.maximum(left, LEFT))
+    g_b = np.einsum("bij,bj->bi", axes, along) @ half
+    found = g_b.T @ g_b * (count - 1) / count
+    square = float(step @ pseudo_inverse(found) @ step)
+    return found + np.outer(step, step) * max(1 - EXPECTED / max(square, EXPECTED), 0.0)
 
 
 def pseudo_inverse(A: np.ndarray) -> np.ndarray:
@@ -181,10 +194,42 @@ def weak_twists(info: np.ndarray, points: np.ndarray, basis: np.ndarray | None =
     return (B @ vectors)[:, values <= HARDLY * max(values[-1], 1e-300)]
 
 
-def undetermined(info: np.ndarray, points: np.ndarray, basis: np.ndarray | None = None) -> list[str]:
-    """The same in words."""
+def unopposed(
+    twists: np.ndarray, source: Surface, target: Surface, T_target_source: np.ndarray, centre: np.ndarray
+) -> np.ndarray:
+    """Of twists (6, k) in the target's frame about ``centre`` (3,), each 1 long: those that no surface opposes (6, j).
+
+    How far a voxel moves along its normal, by the source's normal times by the target's: the errors of the two have
+    nothing to do with each other and cancel in the sum, where one normal's own square would add up to a pretence of
+    information (instrumental variables). Every voxel counts alike: the few that hold a direction, as windows' sides
+    along a facade, are those that a robust weight takes for outliers of a flat wall.
+    """
+    along = []
+    back = np.linalg.inv(T_target_source)
+    for a, b, T in ((source, target, T_target_source), (target, source, back)):
+        moved = transform_points(T, a.points)
+        distance, match = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
+        here = np.flatnonzero(np.isfinite(distance) & a.solid)
+        here = here[b.solid[match[here]]]
+        own, other, x = a.normals[here], b.normals[match[here]], a.points[here]
+        if a is source:
+            own, x = own @ T_target_source[:3, :3].T, moved[here]
+        else:
+            other = other @ T_target_source[:3, :3].T
+        other = other * np.sign(np.einsum("ni,ni->n", own, other))[:, None]
+        along.append([linearise(x, x, n, centre)[1].T @ twists for n in (own, other)])
+    own, other = np.concatenate(along, 1)  # (N, k) each
+    both = own.T @ other
+    values, turn = np.linalg.eigh((both + both.T) / 2)
+    chance = np.sqrt((((own @ turn) * (other @ turn)) ** 2).sum(0))
+    opposed = values > np.maximum(OPPOSED, SURELY * chance)
+    return (twists @ turn)[:, ~opposed] if opposed.any() else twists
+
+
+def in_words(twists: np.ndarray) -> list[str]:
+    """Twists (6, k) as what the scans do not determine."""
     said = []
-    for vector in weak_twists(info, points, basis).T:
+    for vector in twists.T:
         omega, v = vector[:3], vector[3:]
         turns = v @ v < 0.5  # of the mean square displacement: it turns more than it shifts
         axis = omega if turns else v

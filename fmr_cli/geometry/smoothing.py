@@ -44,12 +44,13 @@ class Roughness:
     share: the roughness by ``local_planes``: 0.05 is clean, 0.2 noisy, or so sparse that 10 neighbours show the shape.
     growth: by what factor the deviation grows from these to wide neighbourhoods: noise is as large over any (up to the
     root of the numbers' ratio, where it is larger than the neighbourhoods), while at a crease the deviation grows as
-    their radius, on a bend as its square. deviation: of the small neighbourhoods, own unit.
+    their radius, on a bend as its square. noise: the small neighbourhoods' deviation, own unit, less what a crease has
+    of it that makes it grow so much: nothing of a surface that is bent and clean.
     """
 
     share: float
     growth: float
-    deviation: float
+    noise: float
 
 
 def roughness(points: np.ndarray, wide: int) -> Roughness:
@@ -59,6 +60,8 @@ def roughness(points: np.ndarray, wide: int) -> Roughness:
     near, radius = planes_through(some, tree, NEAR)[2:]
     share, deviation = float(np.median(near / radius)), float(np.median(near))
     if wide >= tree.n:
-        return Roughness(share, np.inf, deviation)
+        return Roughness(share, np.inf, 0.0)
     far = planes_through(some, tree, wide)[2]
-    return Roughness(share, float(np.median(far / np.maximum(near, 1e-300))), deviation)
+    growth = float(np.median(far / np.maximum(near, 1e-300)))
+    wider = wide / NEAR  # in area; with noise n and a crease's deviation c: near² = n² + c², far² = n² + wider c²
+    return Roughness(share, growth, deviation * float(np.sqrt(np.clip((wider - growth**2) / (wider - 1), 0, 1))))

@@ -96,13 +96,15 @@ def describe(
     """
     T = pair.leave_centred(best.T_target_source)
     T[:3, :3] *= factor
-    noise = [cloud.deviation for cloud in roughnesses(pair)]
+    noise = [cloud.noise for cloud in roughnesses(pair)]
     eyes = (pair.source.eye, pair.target.eye)
     certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3), noise, eyes)
     rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
     points = smaller(pair, best.T_target_source)
     centre = points.mean(0)
-    weak = observability.undetermined(observability.about(certain.information, centre), points - centre, in_use(pair))
+    twists = observability.weak_twists(observability.about(certain.information, centre), points - centre, in_use(pair))
+    twists = observability.unopposed(twists, pair.s, pair.t, best.T_target_source, centre)
+    weak = observability.in_words(twists)
     aligned = best.confidence >= ALIGNED and not weak
     reasons = [f"the scans do not determine: {'; '.join(weak)}"] if weak else []
     alternatives = [

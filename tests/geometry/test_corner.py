@@ -63,3 +63,20 @@ def test_planes_that_are_parallel_make_no_corner() -> None:
     front = front[front[:, 0] % 0.8 < 0.4]
     ground = rng.uniform(0, 2, (6000, 3)) * [1, 1, 0]
     assert beyond(np.concatenate([wall, front, ground])) > 0.1
+
+
+def test_windows_less_than_two_voxels_deep_are_no_part_of_their_wall() -> None:
+    """A third of the wall stands back by 1.4 edges: it does not make the wall that thick."""
+    rng = np.random.default_rng(0)
+    wall, ground = (rng.uniform(0, 2, (9000, 3)) * scale for scale in ([1, 0, 1], [1, 1, 0]))
+    wall[wall[:, 0] % 0.6 < 0.2, 1] = -1.4 * EDGE
+    end = rng.uniform(0, 2, (9000, 3)) * [0, 1, 1]
+    assert beyond(np.concatenate([wall, ground, end]) + rng.normal(0, 0.002, (27000, 3))) > 0.05
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.4])
+def test_a_noisy_corner_has_hardly_more(noise: float) -> None:
+    """Noise in voxel edges, of the points: thickest where it is densest, a plane still holds what it scatters."""
+    rng = np.random.default_rng(0)
+    points = corner(rng, (2, 2, 2))
+    assert beyond(points + rng.normal(0, noise * EDGE, points.shape)) < 0.02

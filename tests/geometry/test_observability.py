@@ -49,8 +49,7 @@ def shaken(points: np.ndarray, seed: int) -> np.ndarray:
 def test_what_a_shape_does_not_determine_is_named(shape, said: set[str]) -> None:
     points = shape()
     source, target = (Surface(shaken(points, seed), 0.1) for seed in (0, 1))
-    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
-    weak = observability.undetermined(info, target.points)
+    weak = observability.in_words(left_open(source, target))
     assert len(weak) == len(said)
     kinds = sorted(w.split(" (")[0] for w in weak)
     assert kinds == sorted(s.split(" (")[0] for s in said)
@@ -64,7 +63,7 @@ def test_a_room_determines_everything(room_scans: Scans) -> None:
     assert info.shape == (6, 6)
     np.testing.assert_allclose(info, info.T, rtol=1e-9, atol=1e-9 * np.abs(info).max())
     assert np.linalg.eigvalsh(info).min() > 0
-    assert observability.undetermined(info, target.points - target.points.mean(0)) == []
+    assert observability.weak_twists(info, target.points - target.points.mean(0)).shape == (6, 0)
 
 
 def test_along_a_street_a_roll_is_determined_as_far_as_it_moves_anything() -> None:
@@ -77,7 +76,15 @@ def test_along_a_street_a_roll_is_determined_as_far_as_it_moves_anything() -> No
     source, target = (Surface(street + rng.normal(0, 0.01, street.shape), 0.3) for _ in "ab")
     info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
     centre = target.points.mean(0)
-    assert observability.undetermined(observability.about(info, centre), target.points - centre) == []
+    assert observability.weak_twists(observability.about(info, centre), target.points - centre).shape == (6, 0)
+
+
+def left_open(source: Surface, target: Surface) -> np.ndarray:
+    """The twists (6, k) that two scans of one frame do not determine: what ``align`` names."""
+    centre = target.points.mean(0)
+    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
+    weak = observability.weak_twists(observability.about(info, centre), target.points - centre)
+    return observability.unopposed(weak, source, target, np.eye(4), centre)
 
 
 def ball(rng: np.random.Generator) -> np.ndarray:
@@ -106,10 +113,37 @@ def test_few_points_that_fall_differently_determine_no_more(shape, said: str) ->
         Surface(points, working_scale(points, np.random.default_rng(0))[0])
         for points in (shape(np.random.default_rng(seed)) for seed in (0, 1))
     )
-    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
+    assert any(w.startswith(said) for w in observability.in_words(left_open(source, target)))
+
+
+def facade(rng: np.random.Generator, depth: float) -> np.ndarray:
+    """A wall of 16 m by 5 m over its pavement, and two windows that are let into it by ``depth``."""
+    wall = rng.uniform([-8, 0, 0], [8, 0, 5], (9000, 3))
+    floor = rng.uniform([-8, -3, 0], [8, 0, 0], (5000, 3))
+    sides = []
+    for left in (-4.0, 3.0):
+        window = (np.abs(wall[:, 0] - left - 0.6) < 0.6) & (np.abs(wall[:, 2] - 2) < 0.7)
+        wall[window, 1] += depth
+        sides += [rng.uniform([x, 0, 1.3], [x, depth, 2.7], (int(160 * depth), 3)) for x in (left, left + 1.2)]
+    return np.vstack([wall, floor, *sides])
+
+
+@pytest.mark.parametrize(("depth", "shifts"), [(0.0, 1), (0.2, 0)])
+def test_the_sides_of_a_few_windows_determine_a_facade(depth: float, shifts: int) -> None:
+    """Against the wall they are hardly any information, and yet all that it takes; without them, nothing holds it."""
+    source, target = (Surface(shaken(facade(np.random.default_rng(i), depth), i), 0.15) for i in (0, 1))
     centre = target.points.mean(0)
-    weak = observability.undetermined(observability.about(info, centre), target.points - centre)
-    assert any(w.startswith(said) for w in weak)
+    info = observability.certainty(source, target, np.eye(4), np.zeros(3)).information
+    weak = observability.weak_twists(observability.about(info, centre), target.points - centre)
+    assert weak.shape[1] == 1
+    assert left_open(source, target).shape[1] == shifts
+
+
+def test_normals_that_noise_turns_hold_nothing() -> None:
+    """A plane whose normals lean by 4 to 7 deg, each scan's another way: by themselves they would oppose all shifts."""
+    noisy = [plane() + np.random.default_rng(i).normal(0, 0.02, plane().shape) for i in (0, 1)]
+    source, target = (Surface(points, 0.08) for points in noisy)
+    assert left_open(source, target).shape[1] == 3
 
 
 def test_more_noise_is_less_information() -> None:
@@ -171,8 +205,8 @@ def test_a_turn_is_seen_about_the_scan_however_far_the_map_s_centre_is(room_scan
     away = np.array([80.0, 30.0, 0.0])
     far = observability.certainty(source, target, np.eye(4), away).information
     points = target.points - target.points.mean(0)
-    assert observability.undetermined(far, points)
-    assert not observability.undetermined(observability.about(far, -away), points)
+    assert observability.weak_twists(far, points).shape[1]
+    assert not observability.weak_twists(observability.about(far, -away), points).shape[1]
     np.testing.assert_allclose(observability.about(far, -away), near, rtol=1e-6, atol=1e-6 * np.abs(near).max())
 
 
@@ -184,6 +218,37 @@ def test_a_direction_that_one_block_alone_holds_is_no_division_by_nothing() -> N
     found = observability.sandwich(J, pull, np.ones(48), block)
     assert np.isfinite(found).all()
     assert 0.3 < np.sqrt(found[0, 0] * 8) < 3  # of unit noise, seen eight times
+
+
+def drawn(rng: np.random.Generator, blocks: int, each: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """J (6, N), its residuals at the truth, which a block has in common, and the blocks (N,)."""
+    block = np.repeat(np.arange(blocks), each)
+    J = rng.normal(size=(6, blocks))[:, block] + 0.3 * rng.normal(size=(6, blocks * each))
+    return J, rng.normal(size=blocks)[block] + 0.5 * rng.normal(size=blocks * each), block
+
+
+def test_few_blocks_give_as_much_covariance_as_the_error_has() -> None:
+    """Fifteen blocks, their residuals at the estimate; by the jackknife it would be 1.4 times as much."""
+    rng = np.random.default_rng(1)
+    J, _, block = drawn(rng, 15, 20)
+    errors, found = [], []
+    for _ in range(400):
+        r = rng.normal(size=15)[block] + 0.5 * rng.normal(size=len(block))
+        x = -np.linalg.solve(J @ J.T, J @ r)
+        errors.append(x)
+        found.append(observability.sandwich(J, r + x @ J, np.ones(len(block)), block))
+    true = np.cov(np.array(errors).T)
+    ratio = np.trace(np.linalg.solve(true, np.mean(found, axis=0))) / 6
+    assert 0.75 < ratio < 1.25
+
+
+def test_another_optimum_adds_along_the_step_to_it_alone() -> None:
+    J, r, block = drawn(np.random.default_rng(2), 60, 10)
+    best = r - np.linalg.lstsq(J.T, r, rcond=None)[0] @ J
+    step = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0])  # of tens of deviations
+    here, away = (observability.sandwich(J, pull, np.ones(len(r)), block) for pull in (best, best + step @ J))
+    grown = away - here
+    np.testing.assert_allclose(grown, np.outer(step, step), atol=0.03 * 4)
 
 
 def test_information_says_the_same_of_a_motion_in_another_frame() -> None:

@@ -20,9 +20,10 @@ def test_noise_is_rough_and_a_curved_surface_is_not() -> None:
     assert roughness(ball(0.05), 30).share > 0.15
 
 
-def test_the_deviation_is_that_of_the_noise() -> None:
-    assert roughness(ball(0.01), 30).deviation == pytest.approx(0.01, rel=0.3)
-    assert roughness(10 * ball(0.01), 30).deviation == pytest.approx(0.1, rel=0.3)
+def test_noise_has_the_points_own_length_and_a_bend_has_none() -> None:
+    assert roughness(ball(0.01), 30).noise == pytest.approx(0.01, rel=0.3)
+    assert roughness(10 * ball(0.01), 30).noise == pytest.approx(0.1, rel=0.3)
+    assert roughness(ball(0.0), 30).noise == 0
 
 
 def test_noise_does_not_grow_with_the_neighbourhood_and_shape_does() -> None:
