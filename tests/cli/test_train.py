@@ -12,6 +12,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from fmr_cli.cli import app
+
 RECIPE = """
 start = "scratch"
 feature_dim = 32
@@ -255,3 +257,13 @@ def test_bad_input_is_one_line(tmp_path, fmr, samples, arguments, said):
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert (tmp_path / "full/state.safetensors").read_text() == "a run"
+
+
+def test_threads_that_wait_sleep_unless_the_user_says_otherwise(monkeypatch):
+    monkeypatch.setattr(app, "app", lambda: None)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    app.main()
+    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    app.main()
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
