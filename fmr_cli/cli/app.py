@@ -64,8 +64,8 @@ def main() -> None:
     With --debug, before the command or after it, the traceback is shown instead of the line.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy's products are small here; its threads only wait
-    # torch's threads sleep while one waits for another: spinning, they keep the other one off a core that is shared. Beside
-    # other work 60 steps of `train` took 92 s so and 7 s asleep.
+    # torch's threads sleep while one waits for another: spinning, they keep the other one off a core that is shared.
+    # Beside other work 60 steps of `train` took 92 s so and 7 to 12 s asleep.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         app()
