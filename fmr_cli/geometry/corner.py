@@ -49,17 +49,17 @@ def plane(points: np.ndarray, normals: np.ndarray, about: np.ndarray, edge: floa
         normal = np.linalg.eigh((points[about] - middle).T @ (points[about] - middle))[1][:, 0]
         height = (points - middle) @ normal
         alike = (np.abs(height) < OFF * edge) & (np.abs(normals @ normal) > ALONG)
-        layer = thickest(height[alike], 2 * LEAST_OFF * edge)
-        level = float(np.median(layer)) if len(layer) else 0.0
-        sigma = NORMAL * float(np.median(np.abs(layer - level))) if len(layer) else 0.0
+        layer = thickest(height[alike] if alike.any() else np.zeros(1), 2 * LEAST_OFF * edge)
+        level = layer[len(layer) // 2]
+        sigma = NORMAL * np.median(np.abs(layer - level))
         on = np.abs(height - level) < np.clip(SIGMAS * sigma, LEAST_OFF * edge, OFF * edge)
         about = alike & on if (alike & on).sum() >= PLANES else about
     return normal, on
 
 
 def thickest(heights: np.ndarray, width: float) -> np.ndarray:
-    """Those of heights (N,) in the window of ``width`` that has most: of a wall and its windows, the wall."""
+    """Those of heights (N,) in the window of ``width`` that has most, in order: of a wall and its windows, the wall."""
     heights = np.sort(heights)
-    counts = np.searchsorted(heights, heights + width, side="right") - np.arange(len(heights))
-    first = int(counts.argmax()) if len(heights) else 0
-    return heights[first : first + int(counts.max(initial=0))]
+    ends = heights.searchsorted(heights + width, side="right")
+    first = int((ends - np.arange(len(heights))).argmax())
+    return heights[first : ends[first]]

@@ -185,6 +185,14 @@ def test_a_corridor_is_named() -> None:
     assert here.undetermined == ["shift along (1.00, 0.00, 0.00)"]
 
 
+def test_a_hall_is_held_by_the_few_things_in_it() -> None:
+    """A hall of columns with some boxes: against floor and ceiling they are hardly any information along one way."""
+    pair = fresh_pair("columns with things", 913, 3)
+    here = align(PointCloud(pair.source), PointCloud(pair.target))
+    assert (here.undetermined, here.status) == ([], "aligned")
+    assert pair.is_right(here.T_target_source)
+
+
 def test_covariance_and_information_are_each_other_s_inverse(found: Registration, room_scans: Scans) -> None:
     assert found.information.shape == found.covariance.shape == (6, 6)
     np.testing.assert_allclose(found.covariance, found.covariance.T, rtol=1e-6)
