@@ -75,7 +75,7 @@ def test_a_leap_that_registration_is_not_sure_of_has_to_fit_clearly_better(turni
     monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), elsewhere))
     # A door stands before the scanner: nothing fits well, and another place hardly better.
     fits = {"features": Fit(elsewhere, overlap, 1.0, "features")}
-    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: fits.get(name, Fit(T, 0.35, 1.0, name)))
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name, **_: fits.get(name, Fit(T, 0.35, 1.0, name)))
     assert odometry._best_fit(prepare_scan(scans[5], frame), odometry.motion.expect(None, 1.0)).start == start
 
 
@@ -114,7 +114,7 @@ def test_across_a_gap_all_points_must_put_a_scan_where_the_thinned_ones_do(
 def test_a_scan_across_a_gap_is_where_all_points_have_it_and_uncertain_where_they_have_it_not(at_a_gap, monkeypatch):
     odometry, scan, T_map_scan, _ = at_a_gap
     monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), T_map_scan))
-    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: Fit(T, 0.2, 1.0, name))
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name, **_: Fit(T, 0.2, 1.0, name))
     for sure in (True, False):
         monkeypatch.setattr(odometry, "_borne_out", lambda scan, T, fit, sure=sure: sure)
         fit = odometry._best_fit(scan, odometry.motion.expect(None, 1.0))
