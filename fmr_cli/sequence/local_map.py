@@ -72,6 +72,24 @@ class Keyframe:
     T_map_scan: np.ndarray
 
 
+class Level:
+    """A Gaussian voxel map of one edge. What is added waits until somebody asks, which for large edges is seldom."""
+
+    def __init__(self, edge: float) -> None:
+        self._map = small_gicp.GaussianVoxelMap(edge)
+        self._map.set_lru(horizon=NO_LRU)
+        self._waiting: list[tuple[small_gicp.PointCloud, np.ndarray]] = []
+
+    def add(self, cloud: small_gicp.PointCloud, T_map_cloud: np.ndarray) -> None:
+        self._waiting.append((cloud, T_map_cloud))
+
+    def map(self) -> small_gicp.GaussianVoxelMap:
+        for cloud, T_map_cloud in self._waiting:
+            self._map.insert(cloud, T_map_cloud)
+        self._waiting.clear()
+        return self._map
+
+
 class LocalMap:
     """The last keyframes as Gaussian voxel maps of three edges, and as planes; a known map below them, if there is one.
 
@@ -85,13 +103,11 @@ class LocalMap:
         self._clear()
 
     def _clear(self) -> None:
-        self.levels = {edge: small_gicp.GaussianVoxelMap(edge) for edge in (FINE, COARSE, WIDE)}
-        for level in self.levels.values():
-            level.set_lru(horizon=NO_LRU)
+        self.levels = {edge: Level(edge) for edge in (FINE, COARSE, WIDE)}
         self.planes = PlaneMap(two_sided=self.known is not None)
         if self.known:
             for level in self.levels.values():
-                level.insert(self.known.cloud)
+                level.add(self.known.cloud, np.eye(4))
             self.planes.insert(self.known.points, self.known.normals, np.eye(4))
 
     def insert(self, index: int, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
@@ -115,7 +131,7 @@ class LocalMap:
             points, normals = points[new], normals[new]
             fine = coarse = with_covariances(points, NEIGHBOURS)
         for edge, level in self.levels.items():
-            level.insert(fine if edge == FINE else coarse, T_map_scan)
+            level.add(fine if edge == FINE else coarse, T_map_scan)
         self.planes.insert(points, normals, T_map_scan)
 
     def fit(
@@ -128,7 +144,7 @@ class LocalMap:
         T_map_scan, cloud = T_map_guess, scan.fitted if few else scan.cloud
         for edge in edges:
             found = small_gicp.align(
-                self.levels[edge], cloud, T_map_scan, max_correspondence_distance=REACH * edge, num_threads=1,
+                self.levels[edge].map(), cloud, T_map_scan, max_correspondence_distance=REACH * edge, num_threads=1,
                 max_iterations=MAX_ITERATIONS, rotation_epsilon=ROTATION_EPSILON * edge,
                 translation_epsilon=TRANSLATION_EPSILON * edge,
             )  # fmt: skip
