@@ -4,14 +4,15 @@
     python -m benchmarks.drives street64 mine16 --frames 60 --out /tmp/drives
 
 Scans are made once per --out and kept there. A step (one frame to the next) is wrong where it is more than 0.1 m and a
-twentieth of its length off, or 2 deg; "silent" counts those of frames that are called aligned.
+twentieth of its length off, or 2 deg; "silent" counts those of frames that are called aligned. A loop is wrong where
+its two frames are more than half a metre, or 2 deg, off each other on the closed path.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ from fmr_cli.synthetic.drives import (
 )
 
 WRONG_SHIFT, WRONG_SHARE, WRONG_DEGREES = 0.1, 0.05, 2.0  # m, of the step, deg
+WRONG_LOOP = 0.5  # m that a loop's two frames may be off each other once it is closed
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)  # of the path: the segments' lengths
 
 
@@ -108,6 +110,16 @@ def errors(poses: np.ndarray, truth: np.ndarray) -> tuple[float, float, np.ndarr
     return drift, float(100 * end / length), wrong
 
 
+def wrong_loops(poses: np.ndarray, truth: np.ndarray, closed: Iterable[tuple[int, int]]) -> int:
+    """How many of the loops, pairs of frames, a path has closed wrongly."""
+    wrong = 0
+    for earlier, later in closed:
+        found, true = (np.linalg.inv(path[earlier]) @ path[later] for path in (poses, truth))
+        degrees, shift = pose_error(found, true)
+        wrong += bool(shift > WRONG_LOOP or degrees > WRONG_DEGREES)
+    return wrong
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="drives, all if none is named")
@@ -118,8 +130,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     table = Table(
-        "drive", "method", "frames", "m", "drift %", "end %", "uncertain", "wrong", "silent", "loops", "s/frame"
-    )
+        "drive", "method", "frames", "m", "drift %", "end %", "uncertain", "wrong", "silent", "loops", "loops wrong",
+        "s/frame",
+    )  # fmt: skip
     for name, each in drives().items():
         if args.names and name.split(",")[0] not in args.names and name not in args.names:
             continue
@@ -135,7 +148,9 @@ def main() -> None:
         silent = wrong & sure[1:] & sure[:-1]
         table.add_row(
             name, "fmr", str(len(files)), f"{length:.0f}", f"{drift:.3f}", f"{end:.3f}", str((~sure).sum()),
-            str(wrong.sum()), str(silent.sum()), str(result.loops) if args.loops else "", f"{seconds:.3f}",
+            str(wrong.sum()), str(silent.sum()),
+            *([str(result.loops), str(wrong_loops(result.poses, truth, result.closed))] if args.loops else ["", ""]),
+            f"{seconds:.3f}",
         )  # fmt: skip
         if not args.no_peers:
             start = time.perf_counter()
@@ -143,7 +158,7 @@ def main() -> None:
             seconds = (time.perf_counter() - start) / len(files)
             drift, end, wrong = errors(poses, truth)
             table.add_row(
-                "", "KISS-ICP", "", "", f"{drift:.3f}", f"{end:.3f}", "", str(wrong.sum()), "", "", f"{seconds:.3f}"
+                "", "KISS-ICP", "", "", f"{drift:.3f}", f"{end:.3f}", "", str(wrong.sum()), "", "", "", f"{seconds:.3f}"
             )
     Console(width=150).print(table)
 

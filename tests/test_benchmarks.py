@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import paper, speed, starts
+from benchmarks import drives, paper, speed, starts
 from benchmarks.common import PROTOCOLS, interleaved, make_pair, room_clouds
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.geometry.pose_error import pose_error
@@ -139,3 +139,14 @@ def test_starts_are_counted_on_a_folder(tmp_path: Path, room_scans: tuple) -> No
     rows = {line.split()[0]: line.split()[1:4] for line in said.splitlines()}
     assert rows["features"] == ["1", "1.000", "1.000"]
     assert "search" in rows
+
+
+def test_a_loop_that_is_closed_half_a_metre_off_or_turned_is_a_wrong_one() -> None:
+    truth = np.tile(np.eye(4), (4, 1, 1))
+    truth[:, 0, 3] = [0, 5, 5, 0]
+    assert drives.wrong_loops(truth, truth, [(0, 3), (1, 2)]) == 0
+    shifted, turned = truth.copy(), truth.copy()
+    shifted[3, 1, 3] = 0.6
+    turned[2, :3, :3] = exp(np.radians([0, 0, 3.0, 0, 0, 0]))[:3, :3]
+    assert drives.wrong_loops(shifted, truth, [(0, 3), (1, 2)]) == 1
+    assert drives.wrong_loops(turned, truth, [(0, 3), (1, 2)]) == 1

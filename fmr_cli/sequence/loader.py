@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Generator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
+from fmr_cli.cores import usable_cores
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.se3 import exp, log
+from fmr_cli.io import read_cloud
 from fmr_cli.sequence.deskew import deskew, scan_times, time_span
 from fmr_cli.sequence.journal import Beginning
 from fmr_cli.sequence.prepared_scan import PreparedScan, prepare_scan
 from fmr_cli.sequence.scans import Scans
+from fmr_cli.sequence.voxel_frame import VoxelFrame
+from fmr_cli.workers.local import Pool
 
 READ_AHEAD = 2  # scans that are read while one is registered: enough to hide the disk, few enough for the memory
+# Scans, from which a process is worth its start, which takes half a second of a core that else lies idle.
+WORTH_A_PROCESS = 16
 # A scan so many times larger or smaller than the usual one is not of this sequence: units differ by 10 or more.
 ODD_SIZE = 10.0
 SIZES_KEPT = 15  # scans before it that say what is usual
@@ -40,6 +49,83 @@ class Loaded:
     row: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Reading:
+    """How a scan is read and made ready, as far as that goes without the motion before it; in any thread or process.
+
+    keep_clouds: a map is made of the clouds. whole_way: the scan is not deskewed.
+    """
+
+    frame: VoxelFrame
+    keep_clouds: bool
+    whole_way: bool
+
+    def __call__(self, index: int, name: str, source: Path | PointCloud) -> Loaded:
+        loaded = Loaded(index, row={"frame": index, "file": name, "points": 0})
+        begin = time.perf_counter()
+        attributes = self.keep_clouds or not self.whole_way
+        try:
+            loaded.cloud = source if isinstance(source, PointCloud) else read_cloud(source, attributes=attributes)
+        except CloudFileError as error:
+            loaded.row["message"] = str(error)
+            return loaded
+        end = time.perf_counter()
+        loaded.row |= {"points": len(loaded.cloud), "read_s": round(end - begin, 4)}
+        if self.whole_way:
+            self.make_ready(loaded, end)
+        return loaded
+
+    def make_ready(self, loaded: Loaded, begin: float) -> None:
+        """Thin the cloud, once no motion is left in it; begin: when work on it did."""
+        cloud = loaded.cloud
+        assert cloud
+        loaded.scan = prepare_scan(cloud.points, self.frame)
+        if loaded.scan is None:
+            loaded.row["message"] = f"{cloud.name}: only {len(cloud)} points, too few to register"
+        else:
+            loaded.size = float(np.abs(loaded.scan.points).mean())
+        loaded.cloud = cloud if self.keep_clouds else None
+        loaded.row["prepare_s"] = round(time.perf_counter() - begin, 4)
+
+
+class Readers:
+    """A thread that works while this one registers, and where that gains time a process (small_gicp keeps the lock).
+
+    A context: it ends both. Who does a task changes no bit of it.
+    """
+
+    def __init__(self, apart: bool) -> None:
+        self.thread = ThreadPoolExecutor(1)
+        self.process = Pool(1) if apart else None
+        self.started = self.process.submit(start) if self.process else None
+
+    def __enter__(self) -> Readers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.thread.shutdown(cancel_futures=True)
+        if self.process:
+            self.process.stop()
+
+    def hand_out(self, reading: Reading, *scan: Any) -> Callable[[], Loaded]:
+        """Have a scan read; returns what waits for it. Until the process has started, the thread does it."""
+        if self.process and self.started and self.started.done():
+            with suppress(BrokenExecutor):
+                future = self.process.submit(reading, *scan)
+                return partial(self._from_process, future, reading, *scan)
+        return self.thread.submit(reading, *scan).result
+
+    def _from_process(self, future: Future[Loaded], reading: Reading, *scan: Any) -> Loaded:
+        try:
+            return future.result()
+        except BrokenExecutor:  # it was killed, as for want of memory
+            return reading(*scan)
+
+
+def start() -> None:
+    """The first task of a process: when it is done, Python and what is imported here are there."""
+
+
 class Loader:
     """The scans of a sequence, read and made ready.
 
@@ -54,31 +140,37 @@ class Loader:
     ) -> None:  # fmt: skip
         self.scans, self.beginning, self.T_first_scan = scans, beginning, T_first_scan
         self.deskewed, self.strict, self.keep_clouds = deskewed, strict, keep_clouds
+        self.reading = Reading(beginning.frame, keep_clouds, whole_way=not deskewed)
         self.usual_sizes: deque[float] = deque(maxlen=SIZES_KEPT)
         self.spans: dict[int, tuple[float, float] | None] = {}  # see ``time_span``, by frame
 
     def ahead(self, start: int) -> Generator[Loaded, None, None]:
         """Each scan from index ``start`` on, read while those before it are registered."""
-        with ThreadPoolExecutor(1) as reader:
-            waiting: deque[Future[Loaded]] = deque()
-            try:
-                for index in range(start, len(self.scans)):
-                    for ahead in range(index + len(waiting), min(index + READ_AHEAD + 1, len(self.scans))):
-                        waiting.append(reader.submit(self._read, ahead))
-                    loaded = waiting.popleft().result()
-                    if self.deskewed:  # only now, when the motion before it is known
-                        self._thin(loaded)
-                    self._refuse_odd_size(loaded)
-                    yield loaded
-            finally:
-                for future in waiting:
-                    future.cancel()
+        with Readers(apart=self._worth_a_process(len(self.scans) - start)) as readers:
+            waiting: deque[Callable[[], Loaded]] = deque()
+            for index in range(start, len(self.scans)):
+                for ahead in range(index + len(waiting), min(index + READ_AHEAD + 1, len(self.scans))):
+                    waiting.append(readers.hand_out(self.reading, *self._scan_of(ahead)))
+                loaded = waiting.popleft()()
+                if self.deskewed:  # only now, when the motion before it is known
+                    self._undo_motion(loaded)
+                self._refuse_odd_size(loaded)
+                yield loaded
+
+    def _worth_a_process(self, count: int) -> bool:
+        """Whether so many scans can be made ready where nothing of this process is known, and are enough for it."""
+        if count < WORTH_A_PROCESS or usable_cores() == 1 or self.deskewed or self.keep_clouds:
+            return False
+        return not any(isinstance(source, PointCloud) for source in self.scans.sources)  # they'd have to be sent there
+
+    def _scan_of(self, index: int) -> tuple[int, str, Path | PointCloud]:
+        return index, self.scans.name(index), self.scans.sources[index]
 
     def scan(self, index: int) -> PreparedScan:
         """A scan again, as it was registered. Raises FmrError where its file has changed."""
-        loaded = self._read(index)
+        loaded = self.reading(*self._scan_of(index))
         if self.deskewed:
-            self._thin(loaded)
+            self._undo_motion(loaded)
         if loaded.scan is None:
             raise FmrError(f"{self.scans.where(index)}: cannot be read again, it has changed; leave out --resume")
         return loaded.scan
@@ -87,39 +179,18 @@ class Loader:
         """A scan again with all its attributes, for the map."""
         return self._without_motion(self.scans.read(index, attributes=True), index)
 
-    def _read(self, index: int) -> Loaded:
-        """Read one scan, and thin it where no motion is to be undone; runs beside the registration of others."""
-        loaded = Loaded(index, row={"frame": index, "file": self.scans.name(index), "points": 0})
-        begin = time.perf_counter()
-        try:
-            loaded.cloud = self.scans.read(index, attributes=self.keep_clouds or self.deskewed)
-        except CloudFileError as error:
-            loaded.row["message"] = str(error)
-            return loaded
-        if self.deskewed:
-            self.spans[index] = time_span(loaded.cloud)
-        loaded.row |= {"points": len(loaded.cloud), "read_s": round(time.perf_counter() - begin, 4)}
-        if not self.deskewed:
-            self._thin(loaded)
-        return loaded
-
-    def _thin(self, loaded: Loaded) -> None:
-        """Make a scan that was read ready to register; to deskew it, the frames before it must be known."""
+    def _undo_motion(self, loaded: Loaded) -> None:
+        """Deskew a scan that was read, and make it ready; the frames before it must be known."""
         if loaded.cloud is None:
             return
         begin = time.perf_counter()
+        self.spans[loaded.index] = time_span(loaded.cloud)
         try:
-            cloud = self._without_motion(loaded.cloud, loaded.index)
+            loaded.cloud = self._without_motion(loaded.cloud, loaded.index)
         except CloudFileError as error:
             loaded.cloud, loaded.row["message"] = None, str(error)
             return
-        loaded.scan = prepare_scan(cloud.points, self.beginning.frame)
-        if loaded.scan is None:
-            loaded.row["message"] = f"{cloud.name}: only {len(cloud)} points, too few to register"
-        else:
-            loaded.size = float(np.abs(loaded.scan.points).mean())
-        loaded.cloud = cloud if self.keep_clouds else None
-        loaded.row["prepare_s"] = round(time.perf_counter() - begin, 4)
+        self.reading.make_ready(loaded, begin)
 
     def _without_motion(self, cloud: PointCloud, index: int) -> PointCloud:
         """The scan deskewed, by constant velocity from the two frames before it, for as long as it lasts."""

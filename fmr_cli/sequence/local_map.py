@@ -19,7 +19,7 @@ from fmr_cli.sequence.observability import (
     observe,
 )
 from fmr_cli.sequence.plane_map import PlaneMap
-from fmr_cli.sequence.prepared_scan import MIN_POINTS, NEIGHBOURS, PreparedScan
+from fmr_cli.sequence.prepared_scan import MIN_POINTS, NEIGHBOURS, PreparedScan, with_covariances
 
 # Edges of the map's three levels, voxels: the working one, and two from which larger motions are reached.
 FINE, COARSE, WIDE = 1.0, 2.0, 8.0
@@ -32,7 +32,7 @@ MAP_KEYFRAMES = 20
 # What a point without counterpart costs where two poses are compared, in the unit of ``Fit.cost``. Set by hand: more
 # than a counterpart costs at the end of the reach that still fits.
 OUTLIER_COST = 4.0
-EVERY = 100  # points of a scan, of which one says how far it has moved since a keyframe
+SOME = 500  # points of a scan, about, that say how far it has moved
 # Of how far the neighbours stray from a plane (``PreparedScan.tilt``), what a normal may be wrong by: ten neighbours
 # that stray each for itself leave 1 / sqrt(10 - 3) of it, a little more is allowed for what they share.
 TILTED = 0.5
@@ -72,6 +72,24 @@ class Keyframe:
     T_map_scan: np.ndarray
 
 
+class Level:
+    """A Gaussian voxel map of one edge. What is added waits until somebody asks, which for large edges is seldom."""
+
+    def __init__(self, edge: float) -> None:
+        self._map = small_gicp.GaussianVoxelMap(edge)
+        self._map.set_lru(horizon=NO_LRU)
+        self._waiting: list[tuple[small_gicp.PointCloud, np.ndarray]] = []
+
+    def add(self, cloud: small_gicp.PointCloud, T_map_cloud: np.ndarray) -> None:
+        self._waiting.append((cloud, T_map_cloud))
+
+    def map(self) -> small_gicp.GaussianVoxelMap:
+        for cloud, T_map_cloud in self._waiting:
+            self._map.insert(cloud, T_map_cloud)
+        self._waiting.clear()
+        return self._map
+
+
 class LocalMap:
     """The last keyframes as Gaussian voxel maps of three edges, and as planes; a known map below them, if there is one.
 
@@ -85,13 +103,11 @@ class LocalMap:
         self._clear()
 
     def _clear(self) -> None:
-        self.levels = {edge: small_gicp.GaussianVoxelMap(edge) for edge in (FINE, COARSE, WIDE)}
-        for level in self.levels.values():
-            level.set_lru(horizon=NO_LRU)
+        self.levels = {edge: Level(edge) for edge in (FINE, COARSE, WIDE)}
         self.planes = PlaneMap(two_sided=self.known is not None)
         if self.known:
             for level in self.levels.values():
-                level.insert(self.known.cloud)
+                level.add(self.known.cloud, np.eye(4))
             self.planes.insert(self.known.points, self.known.normals, np.eye(4))
 
     def insert(self, index: int, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
@@ -106,42 +122,42 @@ class LocalMap:
 
     def _add(self, keyframe: Keyframe) -> None:
         scan, T_map_scan = keyframe.scan, keyframe.T_map_scan
-        points, normals, cloud = scan.points[scan.solid], scan.normals[scan.solid], scan.cloud
+        points, normals = scan.points[scan.solid], scan.normals[scan.solid]
+        fine, coarse = scan.cloud, scan.fitted  # large voxels get points enough of the few, too
         if self.known:
             new = self.known.beyond(transform_points(T_map_scan, points))
             if new.sum() < MIN_POINTS:
                 return
             points, normals = points[new], normals[new]
-            cloud = small_gicp.PointCloud(points)
-            small_gicp.estimate_normals_covariances(cloud, num_neighbors=NEIGHBOURS)
-        for level in self.levels.values():
-            level.insert(cloud, T_map_scan)
+            fine = coarse = with_covariances(points, NEIGHBOURS)
+        for edge, level in self.levels.items():
+            level.add(fine if edge == FINE else coarse, T_map_scan)
         self.planes.insert(points, normals, T_map_scan)
 
-    def fit(self, scan: PreparedScan, T_map_guess: np.ndarray, edges: tuple[float, ...], start: str) -> Fit:
+    def fit(
+        self, scan: PreparedScan, T_map_guess: np.ndarray, edges: tuple[float, ...], start: str, few: bool = False
+    ) -> Fit:
         """The scan's pose near a guess, by distribution-to-distribution ICP on the levels ``edges``, one after another.
 
-        start: what the guess is called.
+        start: what the guess is called. few: by few of the scan's points.
         """
-        T_map_scan = T_map_guess
+        T_map_scan, cloud = T_map_guess, scan.fitted if few else scan.cloud
         for edge in edges:
             found = small_gicp.align(
-                self.levels[edge], scan.cloud, T_map_scan, max_correspondence_distance=REACH * edge, num_threads=1,
+                self.levels[edge].map(), cloud, T_map_scan, max_correspondence_distance=REACH * edge, num_threads=1,
                 max_iterations=MAX_ITERATIONS, rotation_epsilon=ROTATION_EPSILON * edge,
                 translation_epsilon=TRANSLATION_EPSILON * edge,
             )  # fmt: skip
             T_map_scan = found.T_target_source
         inliers = max(found.num_inliers, 1)
-        return Fit(T_map_scan, found.num_inliers / len(scan), found.error / inliers, start)
+        return Fit(T_map_scan, found.num_inliers / cloud.size(), found.error / inliers, start)
 
     def polish(self, scan: PreparedScan, fit: Fit, slope: float) -> tuple[Fit, float]:
         """The fit with the pose that robust weights give, what is observed there, and this scan's slope.
 
         slope: how residuals grow with range, see ``plane_map.trust``.
         """
-        T_map_scan, rms, slope, matches = self.planes.fit(
-            scan.points, scan.normals, scan.ranges, scan.solid, fit.T_map_scan, slope
-        )  # fmt: skip
+        T_map_scan, rms, slope, matches = self.planes.fit(scan, fit.T_map_scan, slope)
         seen = self._seen(scan, T_map_scan, matches) if matches else None
         return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms, seen=seen), slope
 
@@ -160,14 +176,14 @@ class LocalMap:
 
     def moved(self, scan: PreparedScan, T_map_scan: np.ndarray) -> float:
         """Voxels, on average, from where the nearest of the keyframes stood."""
-        some = scan.points[::EVERY]
-        return min((displacement(T_map_scan, k.T_map_scan, some) for k in self.keyframes), default=np.inf)
+        return min((displacement(T_map_scan, k.T_map_scan, scan.points) for k in self.keyframes), default=np.inf)
 
 
 def displacement(T_map_a: np.ndarray, T_map_b: np.ndarray, points: np.ndarray) -> float:
     """How far apart two poses put points (N, 3), on average: rotation and shift in one figure."""
-    apart = transform_points(T_map_a, points) - transform_points(T_map_b, points)
-    return float(np.linalg.norm(apart, axis=1).mean())
+    apart = T_map_a - T_map_b
+    some = points[:: max(len(points) // SOME, 1)]
+    return float(np.linalg.norm(some @ apart[:3, :3].T + apart[:3, 3], axis=1).mean())
 
 
 def orthonormal(T_a_b: np.ndarray) -> np.ndarray:

@@ -171,12 +171,12 @@ class Odometry:
         """
         T_map_predicted, expected = next_frame.T_map_scan, EXPECTED_ERROR * max(self.errors, default=np.inf)
         # The widest level reaches far, and slides along a street: it only ever competes with the narrower ones.
-        fits = [] if expected < FINE else [self.map.fit(scan, T_map_predicted, (COARSE, FINE), "prediction")]
+        levels = (FINE,) if expected < FINE else (COARSE, FINE)
         if self.aligned > TRUSTED_AFTER:
-            fit = fits[0] if fits else self.map.fit(scan, T_map_predicted, (FINE,), "prediction")
+            fit = self.map.fit(scan, T_map_predicted, levels, "prediction", few=True)
             if self._usual(fit) and displacement(fit.T_map_scan, T_map_predicted, scan.points) < expected + COARSE:
                 return fit
-            fits = [fit]
+        fits = [self.map.fit(scan, T_map_predicted, levels, "prediction")]
         assert self.motion
         starts = {"zero-motion": self.motion.T_map_scan}
         if self.motion.begun or next_frame.told:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 import small_gicp
+from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.geometry.kernels import NORMAL, geman_mcclure
-from fmr_cli.geometry.point_to_plane import linearise, normal_equations, step_motion
+from fmr_cli.geometry.point_to_plane import linearise, normal_equations
 from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.sequence.observability import Matches
+from fmr_cli.sequence.prepared_scan import PreparedScan
 
 REACH = 1.5  # a point's plane is sought within
 FLAT = 0.8  # length of the mean normal, below which a voxel holds no plane
@@ -52,68 +54,85 @@ class PlaneMap:
         self.sums = np.insert(self.sums, place[~known], sums[~known], 0)
         self.tree = None
 
-    def fit(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        ranges: np.ndarray,
-        solid: np.ndarray,
-        T: np.ndarray,
-        slope: float,
-    ) -> tuple[np.ndarray, float, float, Matches | None]:
-        """The pose near T of points with unit normals (N, 3), seen at ranges (N,); a normal is right where solid (N,).
+    def _settle(self) -> None:
+        """Make planes of the sums, and a tree to look them up; each coordinate in one piece, which is faster."""
+        self.means = np.ascontiguousarray((self.sums[:, 1:4] / self.sums[:, :1]).T)
+        length = np.linalg.norm(self.sums[:, 4:], axis=1)
+        self.normals = np.ascontiguousarray((self.sums[:, 4:] / np.maximum(length, 1e-9)[:, None]).T)
+        self.flat = length / self.sums[:, 0] > FLAT
+        self.tree = small_gicp.KdTree(self.means.T)
+
+    def fit(self, scan: PreparedScan, T: np.ndarray, slope: float) -> tuple[np.ndarray, float, float, Matches | None]:
+        """The scan's pose near T.
 
         slope: how residuals grow with range in this sensor's scans, see ``trust``. Returns the pose, the RMS distance
         from the planes, this scan's own slope, and what was matched; T as it was, NaN and None where too few points lie
         on planes.
         """
         if self.tree is None:
-            self.means = self.sums[:, 1:4] / self.sums[:, :1]
-            length = np.linalg.norm(self.sums[:, 4:], axis=1)
-            self.normals = self.sums[:, 4:] / np.maximum(length, 1e-9)[:, None]
-            self.flat = length / self.sums[:, 0] > FLAT
-            self.tree = small_gicp.KdTree(self.means)
-        edges = np.quantile(ranges, np.linspace(0, 1, BANDS + 1)[1:-1])
-        band = np.searchsorted(edges, ranges)
-        middle = np.log(np.quantile(ranges, (np.arange(BANDS) + 0.5) / BANDS) + 1e-9)
+            self._settle()
+        assert self.tree
+        solid = np.flatnonzero(scan.solid)
+        points, normals = scan.points[solid].T.copy(), scan.normals[solid].T.copy()
+        band, middle = bands(scan.ranges)
+        band = band[solid]
         first = np.zeros(6)
         for _ in range(ROUNDS):
-            found, squared = self.tree.batch_nearest_neighbor_search(transform_points(T, points))
-            plane = np.asarray(found, np.int64)
-            on = np.flatnonzero(solid & (np.asarray(squared) < REACH**2) & self.flat[plane])
-            plane, n = plane[on], self.normals[plane[on]]
-            cosine = np.einsum("ij,ij->i", n, normals[on] @ T[:3, :3].T)
+            moved = T[:3, :3] @ points + T[:3, 3:]
+            found, squared = (column[:, 0] for column in self.tree.batch_knn_search(moved.T, 1))  # in arrays, not lists
+            plane = found.astype(np.int64)
+            facing, n = T[:3, :3] @ normals, self.normals.take(plane, 1)
+            cosine = np.einsum("in,in->n", n, facing)
             agree = (np.abs(cosine) if self.two_sided else cosine) > AGREE
-            on, plane, n, cosine = on[agree], plane[agree], n[agree], cosine[agree]
+            on = np.flatnonzero(agree & (squared < REACH**2) & self.flat[plane])
             if len(on) < 6 * BANDS:
                 return T, float("nan"), float("nan"), None
-            p, offset, b = points[on], self.means[plane], band[on]
+            n, moved, facing, plane = n.take(on, 1), moved.take(on, 1), facing.take(on, 1), plane[on]
             if self.two_sided:
-                n = n * np.sign(cosine)[:, None]
+                n *= np.sign(cosine[on])
+            r, J = linearise(moved.T, self.means.take(plane, 1).T, n.T, np.zeros(3))
+            sigma = scale_by_band(np.abs(r), band[on])
+            worth, scale2 = trust(sigma, slope)[band[on]], (KERNEL * sigma[band[on]]) ** 2
             for again in range(STEPS):
-                moved = transform_points(T, p)
-                r, J = linearise(moved, offset, n, np.zeros(3))
-                if again == 0:
-                    sigma = scale_by_band(np.abs(r), b)
-                    worth, scale2 = trust(sigma, slope)[b], (KERNEL * sigma[b]) ** 2
                 weight = worth * geman_mcclure(r * r, scale2)
+                rms = float(np.sqrt((weight * r * r).sum() / weight.sum()))
                 H, gradient = normal_equations(J, r, weight)
                 step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -gradient)
-                T = step_motion(step) @ T
+                T = turned_and_shifted(step) @ T
+                r = r + step @ J  # to first order; the next round starts from the pose itself
                 first = step if again == 0 else first
             if (np.abs(first) < STILL).all():
                 break
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
-        rms = float(np.sqrt((weight * r**2).sum() / weight.sum()))
-        return T, rms, own, Matches(on, moved, normals[on] @ T[:3, :3].T, n, weight / worth, rms)
+        return T, rms, own, Matches(solid[on], moved.T, facing.T, n.T, weight / worth, rms)
+
+
+def turned_and_shifted(step: np.ndarray) -> np.ndarray:
+    """The motion (4, 4) of a step (omega, v) about the origin, as ``step_motion`` gives it, ten times as fast."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
+    return T
+
+
+def bands(ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of BANDS of equal count each of ranges (N,) is in, and the logarithm of each band's middle (BANDS,)."""
+    ordered, count = np.sort(ranges), len(ranges)
+    parts = np.arange(2 * BANDS) * count // (2 * BANDS)
+    return np.searchsorted(ordered[parts[2::2]], ranges), np.log(ordered[parts[1::2]] + 1e-9)
 
 
 def scale_by_band(r: np.ndarray, band: np.ndarray) -> np.ndarray:
     """Sigma (BANDS,) of the residuals |r| (n,) in each range band (n,); of all where a band has few."""
-    usual = np.median(r)
-    medians = [np.median(r[band == b]) if np.count_nonzero(band == b) > 5 else usual for b in range(BANDS)]
-    return np.maximum(NORMAL * np.array(medians), MIN_SIGMA)
+    ordered = r[np.argsort(band.astype(np.uint8), kind="stable")]
+    ends = np.cumsum(np.bincount(band, minlength=BANDS))
+    parts = np.split(ordered, ends[:-1])
+    return np.maximum(NORMAL * np.array([median(part if len(part) > 5 else r) for part in parts]), MIN_SIGMA)
+
+
+def median(values: np.ndarray) -> float:
+    """The upper one of the middle two, where there are two: without the passes that numpy's takes for NaN."""
+    return np.partition(values, len(values) // 2)[len(values) // 2]
 
 
 def trust(sigma: np.ndarray, slope: float) -> np.ndarray:

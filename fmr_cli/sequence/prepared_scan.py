@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 # Points that a scan is thinned to. Set by hand on the LiDAR and depth-camera drives of the tests: more costs time and
 # gains nothing measurable.
 WORKING_POINTS = 12_000
+# Of them, those that a pose is sought and judged by where it is well predicted, before all of them settle it. On the
+# drives of the tests 2,000 give paths as good as 12,000 do; where all is settled by fewer, steps are worse.
+FITTED_POINTS = 2_000
 POINTS_PER_VOXEL = 2  # of a scan that has few points, on average: finer voxels would hold noise
 # Edges, of the median distance to the tenth neighbour (a point itself among them): on a surface that fills its voxels
 # they lie within 1.7; beyond 2.2, where a scanner's rings lie far apart, most voxels between them are empty.
@@ -36,7 +39,7 @@ MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that th
 LINE = 0.1
 SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from which more neighbours are asked
 TILT = 3.0  # times the scan's median error, at which a normal is half trusted
-FEW = 256  # points that a scan's global feature is made of: enough to tell poses apart, 1 ms
+FEW = 128  # points that a scan's global feature is made of: enough to tell poses apart, under 1 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
 # Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
 # no surface, and on coarser ones a scan slides.
@@ -50,22 +53,21 @@ EDGE_PER_COUNT = 0.6
 class PreparedScan:
     """A scan in voxels: thinned ``points`` (N, 3), unit ``normals`` towards the sensor, ``ranges`` (N,) from it.
 
-    ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``cloud`` is the same for
-    small_gicp, with a covariance per point. ``whole``: (M, 3) float32, the points before thinning; None once nobody
-    will ask for them, since a map of whole scans would take too much memory.
+    ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``whole``: (M, 3) float32,
+    the points before thinning; None once nobody will ask for them, since a map of whole scans would take too much
+    memory. It can be pickled until one of its clouds was asked for.
     """
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray) -> None:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels."""
         self.whole: np.ndarray | None = points.astype(np.float32)
         # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
-        self.cloud = small_gicp.PointCloud(small_gicp.voxelgrid_sampling(points, 1.0).points())
-        self.points = np.ascontiguousarray(self.cloud.points()[:, :3])
-        tree = small_gicp.KdTree(self.cloud)
-        small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=NEIGHBOURS)
-        self.normals = np.ascontiguousarray(self.cloud.normals()[:, :3])
+        self.points = np.array(small_gicp.voxelgrid_sampling(points, 1.0).points()[:, :3], order="C")
+        tree = small_gicp.KdTree(self.points)
         self._scatter = scatter(self.points, neighbours(tree, self.points, NEIGHBOURS))
+        self.normals = smallest_eigenvector(*self._scatter)[0]
         self.solid = ~lines(self._scatter)
+        self._neighbours = NEIGHBOURS  # of the covariances of ``cloud``
         if len(self.points) > MANY_NEIGHBOURS and not self.solid.all():
             self._look_wider(tree)
         rays = self.points - sensor
@@ -79,11 +81,22 @@ class PreparedScan:
         Rings across a corridor's floor and ceiling are all that holds a scanner's height and tilt there.
         """
         if self.solid.mean() < 1 - SPARSE:  # then the covariances of all, too
-            small_gicp.estimate_normals_covariances(self.cloud, tree, num_neighbors=MANY_NEIGHBOURS)
+            self._neighbours = MANY_NEIGHBOURS
         on_line = np.flatnonzero(~self.solid)
         wider = scatter(self.points, neighbours(tree, self.points[on_line], MANY_NEIGHBOURS))
         self.normals[on_line] = smallest_eigenvector(*wider)[0]
         self.solid[on_line] = ~lines(wider)
+
+    @cached_property
+    def cloud(self) -> small_gicp.PointCloud:
+        """The points for small_gicp, with a covariance each."""
+        return with_covariances(self.points, self._neighbours)
+
+    @cached_property
+    def fitted(self) -> small_gicp.PointCloud:
+        """FITTED_POINTS of them at most, evenly taken, likewise."""
+        every = -(-len(self.points) // FITTED_POINTS)
+        return with_covariances(self.points[::every], NEIGHBOURS) if every > 1 else self.cloud
 
     def __len__(self) -> int:
         return len(self.points)
@@ -132,6 +145,13 @@ class PreparedScan:
         from fmr_cli.registration.pipeline import prepare
 
         return self.for_align if self.whole is None else prepare(PointCloud(self.whole.astype(float)))
+
+
+def with_covariances(points: np.ndarray, count: int) -> small_gicp.PointCloud:
+    """Points (N, 3) for small_gicp, with the covariance of each one's nearest, so many of them."""
+    cloud = small_gicp.PointCloud(points)
+    small_gicp.estimate_normals_covariances(cloud, num_neighbors=count)
+    return cloud
 
 
 def neighbours(tree: small_gicp.KdTree, points: np.ndarray, count: int) -> np.ndarray:

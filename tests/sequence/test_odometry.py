@@ -11,9 +11,10 @@ from degenerate import placed
 from simulation import drive, make_street, scan
 
 from fmr_cli.io import read_cloud, read_poses
-from fmr_cli.sequence.local_map import Fit
+from fmr_cli.sequence import align_sequence, find_scans
+from fmr_cli.sequence.local_map import Fit, LocalMap
 from fmr_cli.sequence.odometry import Odometry
-from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
+from fmr_cli.sequence.prepared_scan import FITTED_POINTS, choose_voxel, prepare_scan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 REFERENCE = "reference_poses.txt"
@@ -75,7 +76,7 @@ def test_a_leap_that_registration_is_not_sure_of_has_to_fit_clearly_better(turni
     monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), elsewhere))
     # A door stands before the scanner: nothing fits well, and another place hardly better.
     fits = {"features": Fit(elsewhere, overlap, 1.0, "features")}
-    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: fits.get(name, Fit(T, 0.35, 1.0, name)))
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name, **_: fits.get(name, Fit(T, 0.35, 1.0, name)))
     assert odometry._best_fit(prepare_scan(scans[5], frame), odometry.motion.expect(None, 1.0)).start == start
 
 
@@ -114,7 +115,7 @@ def test_across_a_gap_all_points_must_put_a_scan_where_the_thinned_ones_do(
 def test_a_scan_across_a_gap_is_where_all_points_have_it_and_uncertain_where_they_have_it_not(at_a_gap, monkeypatch):
     odometry, scan, T_map_scan, _ = at_a_gap
     monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), T_map_scan))
-    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name: Fit(T, 0.2, 1.0, name))
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name, **_: Fit(T, 0.2, 1.0, name))
     for sure in (True, False):
         monkeypatch.setattr(odometry, "_borne_out", lambda scan, T, fit, sure=sure: sure)
         fit = odometry._best_fit(scan, odometry.motion.expect(None, 1.0))
@@ -175,3 +176,42 @@ def test_real_lidar(shared_data, folder, suffix):
     drift, first = errors(run(scans), truth[:8])
     assert drift < 0.004
     assert first < 0.02
+
+
+def few_of_each_frame(monkeypatch, scans):
+    """By frame from the second on: for each fit to the map, whether it went by few points."""
+    calls, fit, register = [], LocalMap.fit, Odometry.register
+
+    def told(self, *args, few=False):
+        calls[-1].append(few)
+        return fit(self, *args, few=few)
+
+    def each(self, *args):
+        calls.append([])
+        return register(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalMap, "fit", told)
+        patch.setattr(Odometry, "register", each)
+        align_sequence(scans)
+    return calls[1:]
+
+
+def test_few_points_find_a_pose_that_is_as_expected_and_no_other(street, monkeypatch):
+    scans = find_scans(street[0])
+    fits = few_of_each_frame(monkeypatch, scans)
+    assert not any(fits[0])
+    assert fits[-1] == [True]
+    monkeypatch.setattr(Odometry, "_usual", lambda odometry, fit: False)
+    first, *others = few_of_each_frame(monkeypatch, scans)[-1]
+    assert first
+    assert others
+    assert not any(others)
+
+
+def test_few_points_are_a_part_of_the_scan_with_covariances_of_their_own(street):
+    scan = prepare_scan(read_cloud(street[0] / "0.bin").points, VoxelFrame(0.3, np.zeros(3)))
+    assert len(scan) > FITTED_POINTS >= scan.fitted.size() > FITTED_POINTS / 2
+    assert scan.cloud.size() == len(scan)
+    small = prepare_scan(scan.points[:FITTED_POINTS] * 0.9, VoxelFrame(1.0, np.zeros(3)))
+    assert small.fitted is small.cloud
