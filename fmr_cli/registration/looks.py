@@ -19,10 +19,8 @@ from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Stopwatch
 
 REFINED = 8  # hypotheses that are refined, of each look
-PROMISING = 0.4  # of the best overlap score of a look, that a hypothesis has at least as it is found
-# Of the best overlap score among a look's rough poses and what is known, that a rough pose has at least to be judged.
-WORTH = 0.55
-AGAIN = 3  # poses of a look, the best ones, that the next one judges on its own voxels
+WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined, and a rough pose to be judged
+AGAIN = 4  # poses of a look, the best ones, that the next one judges on its own voxels
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
 # A look: the voxel edge, times the one that suits, and keypoints. The first one is often sure already; the second one
 # has its voxels and what is described on them, and is most often sure of what the first one is not.
@@ -69,7 +67,8 @@ def look_again(judge: Judge, former: Judge | None, time: Stopwatch) -> None:
         with time.stage("describe"):
             judge.pair.describe()
     with time.stage("refine"):
-        judge_worthy(judge, [h for c in known for h in hypotheses.from_pose(judge.pair, c.T_target_source, c.start)])
+        for candidate in known:
+            judge_refined(judge, hypotheses.from_pose(judge.pair, candidate.T_target_source, candidate.start)[0])
 
 
 def further(
@@ -139,33 +138,34 @@ def features(pair: Pair, time: Stopwatch) -> list[Hypothesis]:
 def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch, known: float = 0.0) -> None:
     """Refine and judge the hypotheses that are worth it, best first, and the rivals of what then is likely.
 
-    known: the overlap score of a pose that is known otherwise, if any: what has little beside it is not worth it.
+    known: the overlap score of a pose that is known otherwise, if any: what has little beside it is not judged.
     """
     pair = judge.pair
     with time.stage("refine"):
         ranked = sorted((h for h in found if pair.allowed(h.T_target_source)), key=lambda h: -h.score)
-        judge_worthy(judge, [h for h in ranked[:REFINED] if h.score >= PROMISING * ranked[0].score], known)
+        rough = [refinement.roughly(pair, h) for h in ranked[:REFINED] if h.score >= WORTH * ranked[0].score]
+        rough.sort(key=lambda h: -h.score)
+        for hypothesis in rough:
+            if hypothesis.score >= WORTH * max(rough[0].score, known):
+                judge_refined(judge, hypothesis)
     with time.stage("rivals"):
         # What is not likely has no need of rivals; those of a pose that a former look has found are known.
         if likely(judge) and not np.array_equal(judge.rivals_of, judge.best.T_target_source):
             judge.rivals_of = judge.best.T_target_source
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
-            judge_worthy(judge, rivals)
+            for hypothesis in rivals:  # as they are: rough steps might take them back to the pose itself
+                judge_refined(judge, hypothesis)
 
 
-def judge_worthy(judge: Judge, found: list[Hypothesis], known: float = 0.0) -> None:
-    """Judge the poses that hypotheses lead to, those whose rough poses overlap little beside the best one left out."""
-    pair = judge.pair
-    rough = sorted((refinement.roughly(pair, h) for h in found), key=lambda h: -h.score)
-    best = [pair.overlap_score(judge.best.T_target_source)] if judge.candidates else []
-    worth = WORTH * max([known, *best, *(h.score for h in rough[:1])])
-    for hypothesis in rough:
-        if hypothesis.score >= worth and not judge.knows(hypothesis.T_target_source):
-            T = refinement.refined(pair, hypothesis)
-            if pair.allowed(T) and not judge.knows(T):
-                judge.consider(T, hypothesis.start, hypothesis.errors)
-                log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
+def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
+    """Judge the pose that a hypothesis leads to, if the options allow it, unless one or the other is known."""
+    if judge.knows(hypothesis.T_target_source):
+        return
+    T = refinement.refined(judge.pair, hypothesis)
+    if judge.pair.allowed(T) and not judge.knows(T):
+        judge.consider(T, hypothesis.start, hypothesis.errors)
+        log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
 
 
 def likely(judge: Judge) -> bool:

@@ -30,7 +30,7 @@ PATCHES, PATCH_ITERATIONS, BALL_POINTS = 96, 5, 128  # patches on the overlap, I
 # Voxel edges, a step each: first on a few points from anywhere, which tells most hypotheses that lead nowhere; then on
 # more of the common region.
 ROUGH_REACHES, ROUGH_POINTS = (4.0, 3.0, 2.0, 1.5), 400
-FINE_REACHES, PLANE_POINTS = (2.0, 1.5, 1.0, 1.0, 0.7, 0.7), 800
+FINE_REACHES, PLANE_POINTS = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.7), 800
 COMMON_REACH = 4.0  # voxel edges: points nearer than that to the other surface may be of the common region
 DAMPING = 1e-6  # of the diagonal: directions that the overlap does not determine stay where they are
 GICP_TARGET, GICP_SOURCE = 24_000, 8_000  # points, at most: more cost time and gain nothing measurable
@@ -54,11 +54,12 @@ def roughly(pair: Pair, hypothesis: Hypothesis) -> Hypothesis:
     return replace(hypothesis, T_target_source=T, score=pair.overlap_score(T))
 
 
-def refined(pair: Pair, rough: Hypothesis) -> np.ndarray:
-    """The pose that a hypothesis leads to after ``roughly``, near enough to be judged."""
+def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
+    """The pose that a hypothesis leads to, near enough to be judged."""
+    T = pair.motion.exact(hypothesis.T_target_source)
     if not pair.options.refine:
-        return rough.T_target_source if rough.errors else by_patches(pair, rough.T_target_source, FINE)
-    return by_common_planes(pair, rough.T_target_source)
+        return T if hypothesis.errors else by_patches(pair, T, FINE)
+    return by_common_planes(pair, T)
 
 
 def by_patches(

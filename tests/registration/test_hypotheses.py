@@ -91,7 +91,7 @@ def test_what_hardly_overlaps_beside_a_known_pose_is_not_judged() -> None:
     far[:3, 3] = [1.0, 0.7, 0.4]
     poor = Hypothesis(far, "features", pair.overlap_score(far))
     leads_to = refinement.roughly(pair, poor).score
-    looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.54)
+    looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.39)
     assert judge.candidates == []
-    looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.56)
+    looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.41)
     assert len(judge.candidates) == 1
