@@ -394,7 +394,7 @@ def test_the_metrics_are_plain_json(found: Registration) -> None:
 
 @pytest.mark.slow
 def test_scans_far_apart_in_a_street_are_found_on_coarse_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
-    pair = fresh_pair("street, 30 to 60 %", 9001, 3)
+    pair = fresh_pair("street, 30 to 60 %", 9001, 15)
     source, target = PointCloud(pair.source), PointCloud(pair.target)
     assert pair.is_right(align(source, target, hints=False).T_target_source)
     monkeypatch.setattr(looks, "FURTHER", looks.FURTHER[:-1])
