@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,21 +76,18 @@ def certainty(
         cloud.points.mean(0) if eye is None else eye for cloud, eye in zip((source, target), eyes, strict=True)
     )
     source_eye = transform_points(T_target_source, source_eye[None])[0]
-    back = np.linalg.inv(T_target_source)
-    for a, b, T, swapped in ((source, target, T_target_source, False), (target, source, back, True)):
-        moved = transform_points(T, a.points)
-        distance, match = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
-        here = np.isfinite(distance) & a.solid
-        if not here.any():
+    placed = transform_points(T_target_source, source.points)
+    for i, j, onto_target in partners(source, target, T_target_source):
+        if not len(i):
             continue
-        x, y, n = moved[here], b.points[match[here]], b.normals[match[here]]
-        if swapped:  # the target's points on the source's planes, both seen in the target's frame
-            x, y, n = transform_points(T_target_source, y), a.points[here], n @ T_target_source[:3, :3].T
+        x, y = placed[i], target.points[j]
+        n = target.normals[j] if onto_target else source.normals[i] @ T_target_source[:3, :3].T
+        own = target.unevenness[0][j] if onto_target else source.unevenness[0][i]
         r, J = linearise(x, y, n, origin)
-        scale2 = (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * b.edge) ** 2
+        scale2 = (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * target.edge) ** 2
         outward = np.stack([outwards(x, n, source_eye), -outwards(y, n, target_eye)])
         seen.append(np.vstack([r, geman_mcclure(r * r, scale2), geman_mcclure_slope(r * r, scale2), J, y.T, outward]))
-        misfits.append(NORMAL**2 * (np.median(np.abs(r)) ** 2 - np.median(b.unevenness[0][match[here]]) ** 2))
+        misfits.append(NORMAL**2 * (np.median(np.abs(r)) ** 2 - np.median(own) ** 2))
     if not seen:
         return Certainty(np.zeros((6, 6)), np.zeros((6, 6)))
     r, w, slope, *rows = np.hstack(seen)
@@ -108,6 +105,20 @@ def certainty(
     else:
         covariance += inverse * variance
     return Certainty(A / 2 / variance, covariance / np.outer(units, units))
+
+
+def partners(
+    source: Surface, target: Surface, T_target_source: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
+    """Rows of source and target (n,) that lie next to each other, seen from the source and then from the target.
+
+    Each way the nearest point within REACH of each solid one; True where the source's points are put onto the target.
+    """
+    back = np.linalg.inv(T_target_source)
+    for a, b, T, onto_target in ((source, target, T_target_source, True), (target, source, back, False)):
+        distance, match = b.tree.query(transform_points(T, a.points), distance_upper_bound=REACH * b.edge)
+        here = np.flatnonzero(np.isfinite(distance) & a.solid)
+        yield (here, match[here], True) if onto_target else (match[here], here, False)
 
 
 def outwards(points: np.ndarray, normals: np.ndarray, eye: np.ndarray) -> np.ndarray:
@@ -204,18 +215,12 @@ def unopposed(
     information (instrumental variables). Every voxel counts alike: the few that hold a direction, as windows' sides
     along a facade, are those that a robust weight takes for outliers of a flat wall.
     """
-    along = []
-    back = np.linalg.inv(T_target_source)
-    for a, b, T in ((source, target, T_target_source), (target, source, back)):
-        moved = transform_points(T, a.points)
-        distance, match = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
-        here = np.flatnonzero(np.isfinite(distance) & a.solid)
-        here = here[b.solid[match[here]]]
-        own, other, x = a.normals[here], b.normals[match[here]], a.points[here]
-        if a is source:
-            own, x = own @ T_target_source[:3, :3].T, moved[here]
-        else:
-            other = other @ T_target_source[:3, :3].T
+    along, placed = [], transform_points(T_target_source, source.points)
+    for i, j, onto_target in partners(source, target, T_target_source):
+        solid = source.solid[i] & target.solid[j]
+        i, j = i[solid], j[solid]
+        x = placed[i] if onto_target else target.points[j]
+        own, other = source.normals[i] @ T_target_source[:3, :3].T, target.normals[j]
         other = other * np.sign(np.einsum("ni,ni->n", own, other))[:, None]
         along.append([linearise(x, x, n, centre)[1].T @ twists for n in (own, other)])
     own, other = np.concatenate(along, 1)  # (N, k) each
