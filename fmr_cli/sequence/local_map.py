@@ -180,7 +180,7 @@ class LocalMap:
 
 
 def displacement(T_map_a: np.ndarray, T_map_b: np.ndarray, points: np.ndarray) -> float:
-    """How far apart two poses put points (N, 3), on average: rotation and shift in one figure."""
+    """How far apart two poses put points (N, 3), on average over SOME: rotation and shift in one figure."""
     apart = T_map_a - T_map_b
     some = points[:: max(len(points) // SOME, 1)]
     return float(np.linalg.norm(some @ apart[:3, :3].T + apart[:3, 3], axis=1).mean())

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import small_gicp
-from scipy.spatial.transform import Rotation
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.geometry.kernels import NORMAL, geman_mcclure
-from fmr_cli.geometry.point_to_plane import linearise, normal_equations
+from fmr_cli.geometry.point_to_plane import linearise, normal_equations, step_motion
 from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.sequence.observability import Matches
 from fmr_cli.sequence.prepared_scan import PreparedScan
@@ -98,7 +97,7 @@ class PlaneMap:
                 rms = float(np.sqrt((weight * r * r).sum() / weight.sum()))
                 H, gradient = normal_equations(J, r, weight)
                 step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -gradient)
-                T = turned_and_shifted(step) @ T
+                T = step_motion(step) @ T
                 r = r + step @ J  # to first order; the next round starts from the pose itself
                 first = step if again == 0 else first
             if (np.abs(first) < STILL).all():
@@ -106,13 +105,6 @@ class PlaneMap:
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
         return T, rms, own, Matches(solid[on], moved.T, facing.T, n.T, weight / worth, rms)
-
-
-def turned_and_shifted(step: np.ndarray) -> np.ndarray:
-    """The motion (4, 4) of a step (omega, v) about the origin, as ``step_motion`` gives it, ten times as fast."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
-    return T
 
 
 def bands(ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
