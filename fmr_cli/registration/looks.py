@@ -52,11 +52,14 @@ def at_once(
     return further(source, target, options, threads, time, former=judge)
 
 
-def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None) -> Judge:
-    """What is found on a pair's voxels, and what is left there of the poses that a former look has found."""
+def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None, known: float = 0.0) -> Judge:
+    """What is found on a pair's voxels, and what is left there of the poses that a former look has found.
+
+    known: see ``consider``.
+    """
     judge, found = Judge(pair), features(pair, time)
     look_again(judge, former, time)
-    consider(judge, found, time)
+    consider(judge, found, time, known)
     return judge
 
 

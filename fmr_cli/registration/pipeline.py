@@ -19,7 +19,7 @@ from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, mirror, places, refinement
 from fmr_cli.registration.confidence import LIKELY, Candidate, Judge
-from fmr_cli.registration.looks import CLOSER, FIRST, SURE, at_once, consider, features, likely
+from fmr_cli.registration.looks import CLOSER, FIRST, SURE, at_once, coarse_look, likely
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared, check_systems
@@ -95,11 +95,11 @@ def mirror_look(
     with one_blas_thread(), suppress(RegistrationError):
         image = source.mirrored()
         for detail in FIRST, CLOSER:
-            judge, known = Judge(make_pair(image, target, options, threads, *detail)), 0.0
+            known = 0.0
             if beside:
                 pair = make_pair(source, target, options, threads, *detail)
                 known = pair.overlap_score(pair.enter_centred(beside.T_target_source))
-            consider(judge, features(judge.pair, time), time, known)
+            judge = coarse_look(make_pair(image, target, options, threads, *detail), time, known=known)
             if judge.sure(SURE):
                 return judge.best
             if not likely(judge):

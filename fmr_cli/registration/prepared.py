@@ -146,7 +146,7 @@ class Prepared:
             asked = -(-count // CHUNK) * CHUNK
             surface = self.surface(edge)
             index, parts = surface.keypoints(asked), [begun.descriptors] if begun else []
-            new = index[len(parts[0]) if begun else 0 :]
+            new = index[sum(map(len, parts)) :]
             if len(new):
                 parts.append(descriptors(surface, new, encoder))
             return Described(asked, surface.points[index], np.concatenate(parts))

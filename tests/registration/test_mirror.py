@@ -13,7 +13,7 @@ from fmr_cli.errors import CloudFileError, OptionsError, RegistrationError
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.io import read_transform, write_transform
 from fmr_cli.io.transforms import as_transform
-from fmr_cli.registration import Options, align, mirror
+from fmr_cli.registration import Options, align, mirror, pipeline
 from fmr_cli.registration.mirror import MIRROR
 from fmr_cli.registration.pipeline import mirror_look, prepare
 from fmr_cli.registration.units import factor_of
@@ -53,6 +53,18 @@ def test_an_image_is_found_beside_a_pose_that_fits_worse_and_none_beside_a_bette
     wrong = align(mirrored, target, hints=False)
     assert wrong.status != "aligned"
     assert mirror_look(mirrored, target, Options(), beside=wrong) is not None
+
+
+def test_an_image_is_looked_for_beside_the_overlap_of_the_pose_found(
+    clouds: tuple[np.ndarray, PointCloud], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target, told = prepare(PointCloud(clouds[0])), prepare(clouds[1]), []
+    look = pipeline.coarse_look
+    monkeypatch.setattr(pipeline, "coarse_look", lambda *args, known: told.append(known) or look(*args, known=known))
+    mirror_look(source, target, Options())
+    mirror_look(source, target, Options(), beside=align(source, target, hints=False))
+    assert told[0] == 0
+    assert told[-1] > 0.5
 
 
 def test_an_image_has_the_voxels_of_the_cloud_itself(clouds: tuple[np.ndarray, PointCloud]) -> None:
