@@ -159,14 +159,17 @@ class Trainer:
         return values
 
     def plan(self, step_seconds: float) -> None:
-        """Fits the number of steps, and with it the learning rate's cosine, into the minutes."""
+        """Fits the number of steps, and with it the learning rate's cosine, and of renewals into the minutes."""
         assert self.minutes is not None
-        left = MARGIN * self.training_seconds() - self.spent() - self.task.renewals() * self.renewal_seconds
+        left = agreed(MARGIN * self.training_seconds() - self.spent(), self.device)
+        renewal = agreed(self.renewal_seconds, self.device)
+        changes = self.task.fit_renewals(left, renewal)
+        left -= self.task.renewals() * renewal
         each = step_seconds + self.test_seconds / self.recipe.epoch_steps
         steps = self.progress.step + max(int(left / each), 1)
         self.progress.steps = int(agreed(min(steps, self.recipe.steps), self.device))
         self.progress.planned = True
-        self.recipe = self.recipe.changed(steps=self.progress.steps)
+        self.recipe = self.recipe.changed(steps=self.progress.steps, **changes)
         if self.rank == 0:
             self.folder.write(RECIPE, self.recipe.toml())
 

@@ -155,7 +155,7 @@ class ScanRecipe:
 
     kind: str = "scans"
     start: str = "base"  # "base", "scratch" or a .safetensors file
-    rounds: int = 3  # of registering the scans with each other, by what has been learnt so far
+    rounds: int = 3  # of registering the scans with each other, by what has been learnt so far; at most, in a timed run
     scans: int = 40  # registered with each other in a round, at most
     pairs: int = 160  # of them that show one place, drawn for training in a round, at most
     single: int = 48  # pairs made from single scans, in a round

@@ -34,6 +34,7 @@ CURRENT = "current.safetensors"
 RIGHT = "right matches"  # column of metrics.csv: the share of the matches of two scans that are right
 FORGOTTEN = 0.15  # of the right matches on made-up scans, that may be lost
 CHECK_SHARE = 0.2  # of the minutes, that the last test may take
+ROUNDS_SHARE = 0.3  # of the time that is left after the first round, that further ones may take
 RAMP = 30  # steps over which the rate rises: Adam knows its second moments by then, and a run may be short
 
 
@@ -62,6 +63,13 @@ class ScanTask(Task):
 
     def renewals(self) -> int:
         return self.material.renewals()
+
+    def fit_renewals(self, seconds: float, each: float) -> dict[str, int]:
+        """As many more rounds as fit into a share of the seconds: without steps before it, one finds nothing new."""
+        more = int(ROUNDS_SHARE * seconds / each) if each > 0 else self.renewals()
+        self.recipe = self.recipe.changed(rounds=len(self.material.rounds) + min(more, self.renewals()))
+        self.material.recipe = self.recipe
+        return {"rounds": self.recipe.rounds}
 
     def renew(self, step: int, steps: int, files: Files, show: Show) -> list[str]:
         """A round's material, where one begins."""

@@ -59,6 +59,13 @@ class Task(ABC):
         """How often ``renew`` will do so again."""
         return 0
 
+    def fit_renewals(self, seconds: float, each: float) -> dict[str, int]:
+        """Renews no more often than suits a run with so many seconds left, of which each time takes ``each``.
+
+        Returns what this changes of the recipe.
+        """
+        return {}
+
     def check(self, files: Files, seconds: float | None, show: Show) -> dict[str, Any] | None:
         """A last test of the model that is kept, which may replace it; its figures, or None where there is none."""
         return None

@@ -321,3 +321,12 @@ def test_made_up_pairs_are_the_same_each_time():
     a, b = made_up_pair((1, 2)), made_up_pair((1, 2))
     assert np.array_equal(a.source, b.source)
     assert len(a.source) >= 500
+
+
+def test_a_timed_run_registers_no_more_often_than_leaves_time_for_steps(files, found):
+    for seconds, rounds in ((100, 1), (300, 2), (10_000, 3)):
+        task = ScanTask(replace(TINY, rounds=3), files[0][:4], CPU, None, None)
+        task.material.rounds = [found]
+        assert task.fit_renewals(seconds, each=60) == {"rounds": rounds}
+        assert task.renewals() == rounds - 1
+        assert task.material.round_at(99, 100) == rounds - 1
