@@ -25,34 +25,35 @@ STILL = 1e-9  # rad, and voxel edges: a step below it is rounding
 def linearise(
     x: np.ndarray, y: np.ndarray, n: np.ndarray, pivot: np.ndarray, scale: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """r = n·(x - y), (N,), and its derivative by the step (omega, v[, log s]) of ``step_motion``, (6 or 7, N).
+    """r = n·(x - y), (..., N), and its derivative by the step (omega, v[, log s]) of ``step_motion``, (..., 6 or 7, N).
 
-    x: moved points, y: points on the planes, n: unit normals, all (N, 3); pivot (3,): what the step turns about.
+    x: moved points, y: points on the planes, n: unit normals, all (..., N, 3); pivot (3,): what the step turns about.
     A row a parameter, so that each is one contiguous pass.
     """
-    (a, b, c), (nx, ny, nz) = (x - pivot).T, n.T
+    (a, b, c), (nx, ny, nz) = np.moveaxis(x - pivot, -1, 0), np.moveaxis(n, -1, 0)
     rows = [b * nz - c * ny, c * nx - a * nz, a * ny - b * nx, nx, ny, nz]
     if scale:
         rows.append(a * nx + b * ny + c * nz)
-    return np.einsum("ni,ni->n", n, x - y), np.stack(rows)
+    return np.einsum("...i,...i->...", n, x - y), np.stack(rows, -2)
 
 
 def normal_equations(J: np.ndarray, r: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A = Σ w J Jᵀ and b = Σ w J r of ``linearise``: J (d, N), r and weight (N,) -> (d, d), (d,)."""
-    return (J * weight) @ J.T, J @ (weight * r)
+    """A = Σ w J Jᵀ and b = Σ w J r of ``linearise``: J (..., d, N), r and weight (..., N) -> (..., d, d), (..., d)."""
+    return (J * weight[..., None, :]) @ J.swapaxes(-1, -2), (J @ (weight * r)[..., None])[..., 0]
 
 
 def step_motion(step: np.ndarray, pivot: np.ndarray | None = None) -> np.ndarray:
-    """The motion (4, 4) of a step (omega, v[, log s]): x -> s R (x - pivot) + pivot + v, pivot the origin by default.
+    """The motion (..., 4, 4) of steps (omega, v[, log s]), (..., 6 or 7): x -> s R (x - pivot) + pivot + v.
 
-    To first order that of the twist (omega, v), and the same subgroup; v stays the pivot's shift however far it turns.
+    pivot: the origin by default. To first order that of the twist (omega, v), and the same subgroup; v stays the
+    pivot's shift however far it turns.
     """
     pivot = np.zeros(3) if pivot is None else pivot
-    M = np.eye(4)
-    M[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()  # a tenth of the time of ``se3.exp``
-    if len(step) == 7:
-        M[:3, :3] *= np.exp(step[6])
-    M[:3, 3] = pivot + step[3:6] - M[:3, :3] @ pivot
+    M = np.zeros((*step.shape[:-1], 4, 4))
+    R = Rotation.from_rotvec(step[..., :3]).as_matrix()  # a tenth of the time of ``se3.exp``
+    if step.shape[-1] == 7:
+        R = R * np.exp(step[..., 6, None, None])
+    M[..., :3, :3], M[..., :3, 3], M[..., 3, 3] = R, pivot + step[..., 3:6] - R @ pivot, 1.0
     return M
 
 
@@ -67,15 +68,16 @@ def with_scale(basis: np.ndarray, scale: bool) -> np.ndarray:
 
 @dataclass
 class Normal:
-    """The normal equations of point-to-plane at a pose: A = Σ w JᵀJ and b = Σ w Jᵀr over the step (omega, v, log s).
+    """The normal equations of point-to-plane at poses: A = Σ w JᵀJ and b = Σ w Jᵀr over the step (omega, v, log s).
 
-    variance: of the weighted residuals, own unit squared. count: correspondences.
+    A (..., 7, 7), b (..., 7). variance (...): of the weighted residuals, own unit
+    squared. count (...): correspondences.
     """
 
     A: np.ndarray
     b: np.ndarray
-    variance: float
-    count: int
+    variance: np.ndarray
+    count: np.ndarray
 
 
 def point_to_plane(
@@ -88,24 +90,37 @@ def point_to_plane(
     pivot: np.ndarray,
     facing: np.ndarray | None = None,
 ) -> Normal:
-    """Linearise n·(T x - y) over nearest neighbours within reach; the step turns (and scales) about ``pivot`` (3,).
+    """Linearise n·(T x - y) over nearest neighbours within reach, at many poses in one go.
 
-    facing: the source's own normals (N, 3), where only partners that face along count.
+    source: (..., N, 3), T: (..., 4, 4); the step turns (and scales) about ``pivot`` (3,). facing: the source's own
+    normals (..., N, 3), where only partners that face along count.
     """
     moved = transform_points(T, source)
     distance, match = tree.query(moved, distance_upper_bound=reach)
     here = np.isfinite(distance)
+    match = np.where(here, match, 0)
+    y, n = target[match], normals[match]
     if facing is not None:
-        here[here] = face_along(facing[here] @ T[:3, :3].T, normals[match[here]])
-    r, J = linearise(moved[here], target[match[here]], normals[match[here]], pivot, scale=True)
-    s2 = (SCALE * np.median(np.abs(r))) ** 2 + 1e-24 * reach**2 if len(r) else 1.0  # copies fit to rounding
-    w = geman_mcclure(r * r, s2)
-    return Normal(*normal_equations(J, r, w), float((w * r * r).sum() / max(w.sum(), 1e-12)), len(r))
+        here &= face_along(facing @ T[..., :3, :3].swapaxes(-1, -2), n)
+    r, J = linearise(moved, y, n, pivot, scale=True)
+    count, squared = here.sum(-1), r * r
+    s2 = (SCALE * median(np.abs(r), here)) ** 2 + 1e-24 * reach**2  # copies fit to rounding
+    w = np.where(here, geman_mcclure(squared, s2[..., None]), 0.0)
+    return Normal(*normal_equations(J, r, w), (w * squared).sum(-1) / np.maximum(w.sum(-1), 1e-12), count)
+
+
+def median(values: np.ndarray, here: np.ndarray) -> np.ndarray:
+    """The median of those of values (..., N) that are ``here``, 0 of none: (...)."""
+    if not values.size:
+        return np.zeros(values.shape[:-1])
+    ordered, last = np.sort(np.where(here, values, np.inf), axis=-1), here.sum(-1) - 1
+    middle = np.stack([np.maximum(last, 0) // 2, (last + 1) // 2], -1)
+    return np.where(last >= 0, np.take_along_axis(ordered, middle, -1).mean(-1), 0.0)
 
 
 def face_along(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which normals a and b (N, 3), of undetermined sign, agree: (N,)."""
-    return np.abs(np.einsum("ni,ni->n", a, b)) > FACING
+    """Which normals a and b (..., N, 3), of undetermined sign, agree: (..., N)."""
+    return np.abs(np.einsum("...i,...i->...", a, b)) > FACING
 
 
 def constrained(

@@ -165,7 +165,7 @@ def linearised(source: View, target: View, i: int, j: int, T_target_source: np.n
     )
     if found.count < FEW:
         return None
-    return System(i, j, found.A[:6, :6], found.b[:6], found.variance, found.count)
+    return System(i, j, found.A[:6, :6], found.b[:6], float(found.variance), int(found.count))
 
 
 def determined(A: np.ndarray, b: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -35,6 +35,9 @@ AT_BORDER = 0.25
 # a hundred contradicted ones; where a key, a door or some furniture tells a pose from its like, there are tens.
 LIKE, MOSTLY, LIKE_REACH = 8, 6, 3.0
 ONE_THING = 1.5  # voxel edges within which contradicted points are of one thing: next to each other on the grid
+# One point in so many is asked first; where it says that more than so many times as much contradicts the pose as
+# explains it, all would say that more does: of some thousand points the share is known to a few hundredths.
+SOME, PLAINLY = 4, 1.5
 STRETCH_POINTS = 1500  # of the source, on which a change of scale is tried
 STRETCH_REACH = 2.5  # voxel edges
 STRETCH_SIGMAS = 3.0  # deviations that chance may explain
@@ -77,55 +80,84 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
     """Compare two surfaces on the same voxel edge at a pose between their frames.
 
     Of a pose that is more contradicted than explained, which the verdict denies whatever else there is, no cluster is
-    sought: all that contradicts it counts as missing, in one thing, and nothing as detail.
+    sought: all that contradicts it counts as missing, in one thing, and nothing as detail. Where one point in SOME says
+    that plainly, the others are not asked.
     """
-    shares, explained_shares, sums, seen = [], [], np.zeros(7), []
-    for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
-        moved = transform_points(T, a.points)
-        distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
-        near = np.isfinite(distance) & a.solid
-        near[near] = b.solid[index[near]]
-        here = np.flatnonzero(near)
-        there, d = index[here], distance[here] / b.edge
-        n = b.normals[there]
-        off = np.abs(np.einsum("ni,ni->n", moved[here] - b.points[there], n)) / b.edge
-        cosine = np.abs(np.einsum("ni,ni->n", a.normals[here] @ T[:3, :3].T, n))
-        own_off, own_turn = b.unevenness[0][there] / b.edge, b.unevenness[1][there]
-        over = d * d - off * off < OVER**2
-        clear = off > np.maximum(CLEAR, UNEVEN * np.maximum(own_off, a.unevenness[0][here] / a.edge))
-        explained = over & ~clear & (cosine > FACING)
-        touching = d < TOUCHING
-        across = touching & (cosine < ACROSS) & (np.maximum(own_turn, a.unevenness[1][here]) < 1 - FACING)
-        contradicted = over & (b.lean[there] < AT_BORDER) & (clear | across)
-        sums += [
-            explained.sum(), contradicted.sum(), touching.sum(), (off[touching] ** 2).sum(),
-            (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
-        ]  # fmt: skip
-        seen.append((moved[here], n, explained, contradicted))
-        shares.append(touching.sum() / max(a.solid.sum(), 1))
-        explained_shares.append(explained.sum() / max(a.solid.sum(), 1))
+    every = SOME
+    seen = both_ways(source, target, T_target_source, every)
+    sums = np.sum([way.sums for way in seen], 0)
+    if sums[1] <= PLAINLY * sums[0]:
+        every = 1
+        seen = both_ways(source, target, T_target_source, every)
+        sums = np.sum([way.sums for way in seen], 0)
     denied, detail = sums[1] > sums[0], 0.0
-    missing = largest = int(sums[1]) if denied else 0
-    for x, n, explained, contradicted in [] if denied else seen:
-        judged = explained | contradicted
-        missing += amid_their_like(x[judged], contradicted[judged], LIKE_REACH * target.edge)
-        largest += largest_cluster(x[contradicted], ONE_THING * target.edge)
-        common = share_beyond_corner(x[explained], n[explained], target.edge, np.random.default_rng(0))
-        detail += explained.sum() * common
+    explained, contradicted = round(every * sums[0]), round(every * sums[1])
+    missing = largest = contradicted if denied else 0
+    for way in [] if denied else seen:
+        x, judged = way.points, way.explained | way.contradicted
+        missing += amid_their_like(x[judged], way.contradicted[judged], LIKE_REACH * target.edge)
+        largest += largest_cluster(x[way.contradicted], ONE_THING * target.edge)
+        on = way.explained
+        detail += on.sum() * share_beyond_corner(x[on], way.normals[on], target.edge, np.random.default_rng(0))
     off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
     return Agreement(
-        explained=int(sums[0]),
-        contradicted=int(sums[1]),
+        explained=explained,
+        contradicted=contradicted,
         missing=missing,
         largest=largest,
-        overlap=float(max(shares)),
-        explained_share=float(max(explained_shares)),
+        overlap=float(max(way.sums[2] / way.asked for way in seen)),
+        explained_share=float(max(way.sums[0] / way.asked for way in seen)),
         inlier_rmse=float(np.sqrt(off2)) * target.edge if sums[2] else float("inf"),
         offset=float(np.sqrt((off2 + FLOOR**2) / (own_off2 + FLOOR**2))),
         turn=float((max(turns, 0) + FLOOR) / (own_turns + FLOOR)),
         detail=round(detail),
         stretch=stretch(source, target, T_target_source),
     )
+
+
+@dataclass
+class Way:
+    """What one surface says of the other one.
+
+    asked: its points. sums (7,): how many are explained, contradicted, touching; of those that touch, the squares of
+    their offsets and of the surface's own, 1 - |cosine| and the surface's own. Of its points that are near, (N,):
+    where they are in the other's frame (N, 3), the normals there (N, 3), which are explained and which contradicted.
+    """
+
+    asked: int
+    sums: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    explained: np.ndarray
+    contradicted: np.ndarray
+
+
+def both_ways(source: Surface, target: Surface, T_target_source: np.ndarray, every: int) -> list[Way]:
+    """What one point in ``every`` of each surface says of the other one at a pose."""
+    found = []
+    for a, b, T in ((source, target, T_target_source), (target, source, np.linalg.inv(T_target_source))):
+        moved, solid = transform_points(T, a.points[::every]), a.solid[::every]
+        distance, index = b.tree.query(moved, distance_upper_bound=REACH * b.edge)
+        near = np.isfinite(distance) & solid
+        near[near] = b.solid[index[near]]
+        here = np.flatnonzero(near)
+        there, d, own = index[here], distance[here] / b.edge, here * every
+        n = b.normals[there]
+        off = np.abs(np.einsum("ni,ni->n", moved[here] - b.points[there], n)) / b.edge
+        cosine = np.abs(np.einsum("ni,ni->n", a.normals[own] @ T[:3, :3].T, n))
+        own_off, own_turn = b.unevenness[0][there] / b.edge, b.unevenness[1][there]
+        over = d * d - off * off < OVER**2
+        clear = off > np.maximum(CLEAR, UNEVEN * np.maximum(own_off, a.unevenness[0][own] / a.edge))
+        explained = over & ~clear & (cosine > FACING)
+        touching = d < TOUCHING
+        across = touching & (cosine < ACROSS) & (np.maximum(own_turn, a.unevenness[1][own]) < 1 - FACING)
+        contradicted = over & (b.lean[there] < AT_BORDER) & (clear | across)
+        sums = [
+            explained.sum(), contradicted.sum(), touching.sum(), (off[touching] ** 2).sum(),
+            (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
+        ]  # fmt: skip
+        found.append(Way(max(int(solid.sum()), 1), np.array(sums), moved[here], n, explained, contradicted))
+    return found
 
 
 def amid_their_like(points: np.ndarray, some: np.ndarray, reach: float) -> int:

@@ -70,8 +70,7 @@ def look_again(judge: Judge, former: Judge | None, time: Stopwatch) -> None:
         with time.stage("describe"):
             judge.pair.describe()
     with time.stage("refine"):
-        for candidate in known:
-            judge_refined(judge, hypotheses.from_pose(judge.pair, candidate.T_target_source, candidate.start)[0])
+        judge_refined(judge, [h for c in known for h in hypotheses.from_pose(judge.pair, c.T_target_source, c.start)])
 
 
 def further(
@@ -99,8 +98,9 @@ def further(
                 found = features(seen, time)
                 if coarseness >= COARSE:
                     with time.stage("refine"):
-                        rough = [refinement.roughly(seen, h) for h in found]
-                        found = [replace(h, T_target_source=refinement.refined(seen, h)) for h in rough]
+                        rough = refinement.roughly(seen, found)
+                        fine = refinement.refined(seen, rough)
+                        found = [replace(h, T_target_source=T) for h, T in zip(rough, fine, strict=True)]
                 consider(judge, found, time)
             if judge.sure(enough):
                 return judge
@@ -146,27 +146,25 @@ def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch, known: floa
     pair = judge.pair
     with time.stage("refine"):
         ranked = sorted((h for h in found if pair.allowed(h.T_target_source)), key=lambda h: -h.score)
-        rough = [refinement.roughly(pair, h) for h in ranked[:REFINED] if h.score >= WORTH * ranked[0].score]
-        rough.sort(key=lambda h: -h.score)
-        for hypothesis in rough:
-            if hypothesis.score >= WORTH * max(rough[0].score, known):
-                judge_refined(judge, hypothesis)
+        rough = refinement.roughly(pair, [h for h in ranked[:REFINED] if h.score >= WORTH * ranked[0].score])
+        best = max((h.score for h in rough), default=0.0)
+        worth = [h for h in rough if h.score >= WORTH * max(best, known)]
+        judge_refined(judge, sorted(worth, key=lambda h: -h.score))
     with time.stage("rivals"):
         # What is not likely has no need of rivals; those of a pose that a former look has found are known.
         if likely(judge) and not np.array_equal(judge.rivals_of, judge.best.T_target_source):
             judge.rivals_of = judge.best.T_target_source
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
-            for hypothesis in rivals:  # as they are: rough steps might take them back to the pose itself
-                judge_refined(judge, hypothesis)
+            judge_refined(judge, rivals)  # as they are: rough steps might take them back to the pose itself
 
 
-def judge_refined(judge: Judge, hypothesis: Hypothesis) -> None:
-    """Judge the pose that a hypothesis leads to, if the options allow it, unless one or the other is known."""
-    if judge.knows(hypothesis.T_target_source):
-        return
-    T = refinement.refined(judge.pair, hypothesis)
-    if judge.pair.allowed(T) and not judge.knows(T):
+def judge_refined(judge: Judge, found: list[Hypothesis]) -> None:
+    """Judge the poses that hypotheses lead to, in their order: those that the options allow and that are not known."""
+    new = [h for h in found if not judge.knows(h.T_target_source)]
+    for hypothesis, T in zip(new, refinement.refined(judge.pair, new), strict=True):
+        if not judge.pair.allowed(T) or judge.knows(hypothesis.T_target_source) or judge.knows(T):
+            continue
         judge.consider(T, hypothesis.start, hypothesis.errors)
         log.info("%s, overlap score %.2f: %s", hypothesis.start, hypothesis.score, judge.last_word(T))
 

@@ -5,6 +5,7 @@ Poses are between the centred frames of a ``Pair``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,6 @@ from fmr_cli.geometry.gicp import GicpCloud, gicp
 from fmr_cli.geometry.planar import within_plane
 from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_plane, step_motion, with_scale
 from fmr_cli.geometry.sampling import sample
-from fmr_cli.geometry.se3 import exp
 from fmr_cli.geometry.smoothing import NEAR, Roughness, local_planes
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.hypotheses import Hypothesis
@@ -44,22 +44,24 @@ FINER = 4.0  # times the grid of the last step on large clouds, where they are d
 COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
 
 
-def roughly(pair: Pair, hypothesis: Hypothesis) -> Hypothesis:
-    """Where a hypothesis leads to, near enough to tell by its score whether it is worth more: cheap."""
-    T = pair.motion.exact(hypothesis.T_target_source)
-    if hypothesis.errors:  # where the global feature leads to is only roughly right
-        T = by_patches(pair, T, LEVELS)
+def roughly(pair: Pair, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Where hypotheses lead to, near enough to tell by their scores which are worth more: cheap."""
+    if not hypotheses:
+        return []
+    T = [pair.motion.exact(h.T_target_source) for h in hypotheses]
+    # Where the global feature leads to is only roughly right.
+    T = [by_patches(pair, t, LEVELS) if h.errors else t for t, h in zip(T, hypotheses, strict=True)]
     if pair.options.refine:
-        T = by_few_planes(pair, T)
-    return replace(hypothesis, T_target_source=T, score=pair.overlap_score(T))
+        T = list(by_few_planes(pair, np.array(T)))
+    return [replace(h, T_target_source=t, score=pair.overlap_score(t)) for t, h in zip(T, hypotheses, strict=True)]
 
 
-def refined(pair: Pair, hypothesis: Hypothesis) -> np.ndarray:
-    """The pose that a hypothesis leads to, near enough to be judged."""
-    T = pair.motion.exact(hypothesis.T_target_source)
+def refined(pair: Pair, hypotheses: Sequence[Hypothesis]) -> list[np.ndarray]:
+    """The poses that hypotheses lead to, near enough to be judged."""
+    T = [pair.motion.exact(h.T_target_source) for h in hypotheses]
     if not pair.options.refine:
-        return T if hypothesis.errors else by_patches(pair, T, FINE)
-    return by_common_planes(pair, T)
+        return [t if h.errors else by_patches(pair, t, FINE) for t, h in zip(T, hypotheses, strict=True)]
+    return list(by_common_planes(pair, np.array(T))) if T else []
 
 
 def by_patches(
@@ -99,47 +101,52 @@ def balls(surface: Surface, radius: float, length: float) -> Neighbourhoods:
 
 def by_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     """The pose after robust point-to-plane steps on a few voxels, from far to near: what a hypothesis is judged at."""
-    return by_common_planes(pair, by_few_planes(pair, T_target_source))
+    return by_common_planes(pair, by_few_planes(pair, T_target_source[None]))[0]
 
 
 def by_few_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
-    """The pose after a few steps on few points."""
+    """The poses (n, 4, 4) after a few steps on few points."""
     points, facing = (x[:ROUGH_POINTS] for x in pair.some)  # in random order
     return by_steps(pair, T_target_source, points, facing, ROUGH_REACHES)
 
 
 def by_common_planes(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
-    """The pose after steps on the common region, so that at small overlap what only one scan saw does not pull."""
+    """The poses (n, 4, 4) after steps on the common region: at small overlap what only one scan saw would pull."""
     return by_steps(pair, T_target_source, *common_points(pair, T_target_source), FINE_REACHES)
 
 
 def by_steps(
     pair: Pair, T_target_source: np.ndarray, points: np.ndarray, facing: np.ndarray, reaches: tuple[float, ...]
 ) -> np.ndarray:
-    """The pose after a robust point-to-plane step of points, normals (N, 3) of the source for each reach, voxel edges.
+    """The poses (n, 4, 4) after a robust point-to-plane step for each reach (voxel edges), onto what faces along.
 
-    Onto partners that face along.
+    points, facing: of the source, and their normals, ([n,] N, 3). A pose that has too few partners stays where it is.
     """
     scale = pair.options.scale
     basis, T, pivot = with_scale(pair.motion.basis(), scale), T_target_source, np.zeros(3)
-    free = len(basis)
+    free, going = len(basis), np.ones(len(T), bool)
     for reach in reaches:
         normal = point_to_plane(points, pair.t.points, pair.t.normals, pair.t.tree, T, reach * pair.edge, pivot, facing)
-        if normal.count < MIN_POINTS:
-            return T
-        A, b = normal.A[:free, :free], normal.b[:free]
-        step = constrained_step(A + DAMPING * np.diag(np.diag(A)), -b, basis)
-        T = (step_motion(step) if scale else exp(step)) @ T
+        going &= normal.count >= MIN_POINTS
+        A, b = normal.A[:, :free, :free], normal.b[:, :free]
+        step = constrained_step(A * (1 + DAMPING * np.eye(free)), -b, basis)
+        T = np.where(going[:, None, None], step_motion(step) @ T, T)
     return T
 
 
 def common_points(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A few of the source's points that come near the target at a pose, and their normals: (n, 3) each."""
+    """A few of the source's points that come near the target at each pose (n, 4, 4), and their normals: (n, N, 3) each.
+
+    Where there are fewer than N, the rest have no normal, which faces along with nothing.
+    """
     moved = transform_points(T_target_source, pair.s.points)
     near = np.isfinite(pair.t.tree.query(moved, distance_upper_bound=COMMON_REACH * pair.edge)[0])
-    both = np.hstack([pair.s.points[near], pair.s.normals[near]])
-    both = sample(both, PLANE_POINTS, np.random.default_rng(pair.seed))
-    return both[:, :3], both[:, 3:]
+    both = np.hstack([pair.s.points, pair.s.normals])
+    some = [sample(both[here], PLANE_POINTS, np.random.default_rng(pair.seed)) for here in near]
+    found = np.zeros((len(some), max(map(len, some)), 6))
+    for row, each in zip(found, some, strict=True):
+        row[: len(each)] = each
+    return found[..., :3], found[..., 3:]
 
 
 def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:

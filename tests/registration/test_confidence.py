@@ -101,6 +101,22 @@ def test_a_surface_that_floats_over_another_contradicts_it() -> None:
     assert agreement(laid, bare, np.eye(4)).contradicted > 100
 
 
+def test_what_some_points_plainly_deny_all_points_deny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what they don't deny is what all points say it is."""
+    rng = np.random.default_rng(0)
+    a, b = Surface(ball(rng, 0.003), 0.05), Surface(ball(rng, 0.003), 0.05)
+    quick = [agreement(a, b, T) for T in (pose(2, 0.01), pose(80, 0.0), pose(60, 0.1))]
+    monkeypatch.setattr("fmr_cli.registration.agreement.SOME", 1)
+    plain = [agreement(a, b, T) for T in (pose(2, 0.01), pose(80, 0.0), pose(60, 0.1))]
+    assert quick[0] == plain[0]
+    for some, whole in zip(quick[1:], plain[1:], strict=True):
+        assert some != whole
+        assert whole.contradicted > whole.explained
+        assert some.contradicted > some.explained
+        assert some.contradicted == pytest.approx(whole.contradicted, rel=0.15)
+        assert some.explained_share == pytest.approx(whole.explained_share, abs=0.05)
+
+
 def test_what_lies_beyond_the_border_of_a_scan_contradicts_nothing() -> None:
     rng = np.random.default_rng(0)
     wall = rng.uniform(0, 1, (20_000, 3)) * [2, 1, 0]

@@ -90,7 +90,7 @@ def test_what_hardly_overlaps_beside_a_known_pose_is_not_judged() -> None:
     far, judge = np.eye(4), Judge(pair)
     far[:3, 3] = [1.0, 0.7, 0.4]
     poor = Hypothesis(far, "features", pair.overlap_score(far))
-    leads_to = refinement.roughly(pair, poor).score
+    leads_to = refinement.roughly(pair, [poor])[0].score
     looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.39)
     assert judge.candidates == []
     looks.consider(judge, [poor], Stopwatch(), known=leads_to / 0.41)
