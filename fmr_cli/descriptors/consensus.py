@@ -59,10 +59,10 @@ def poses_from_seeds(
     members = np.argpartition(-second, min(NEIGHBOURS, len(source)) - 1, axis=1)[:, :NEIGHBOURS]
     T = motion.fit(source[members], target[members], np.take_along_axis(second, members, 1).astype(float))
     near = residuals(T, source, target) < tolerance
-    best = np.argsort(-(near * use).sum(1), kind="stable")[:REFITTED]
+    near = near[np.argsort(-(near * use).sum(1), kind="stable")[:REFITTED]]
     for _ in range(ROUNDS):
-        T = motion.fit(source[None], target[None], (near[best] + 1e-9) * use)
-        near, best = residuals(T, source, target) < tolerance, slice(None)
+        T = motion.fit(source[None], target[None], (near + 1e-9) * use)
+        near = residuals(T, source, target) < tolerance
     return T
 
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from fmr_cli import PointCloud, write_cloud
 from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.errors import ModelError
-from fmr_cli.multiway.links import Hypothesis, Link
 from fmr_cli.multiway.scans import Scan
+from fmr_cli.registration import Options, prepare
 from fmr_cli.registration.models import model
 from fmr_cli.synthetic import scenes
 from fmr_cli.training.local_views import PATCH_RADIUS, aliases
@@ -34,7 +34,7 @@ from fmr_cli.training.scan_views import (
     visible,
     whole_views,
 )
-from fmr_cli.training.self_registration import BLOCK, drawn, of_all_bands, parts, register_scans, sure_links
+from fmr_cli.training.self_registration import BLOCK, drawn, of_all_bands, register_scans, settled
 
 CPU = torch.device("cpu")
 TINY = ScanRecipe(
@@ -84,29 +84,24 @@ def test_scans_register_themselves_and_every_pair_of_a_part_has_a_pose(files, fo
     assert "pairs show one place" in found.said
 
 
-def test_a_wrong_link_that_is_not_sure_joins_nothing():
-    """Four scans round a cycle; a fifth link, aligned by half, says otherwise and is denied by its triangles."""
-    rng = np.random.default_rng(0)
-    poses = {}
-    for n in range(5):
-        poses[n] = np.eye(4)
-        poses[n][:3, :3], poses[n][:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 2, 3)
-    ends = {(1, 0): 0.95, (2, 1): 0.8, (2, 0): 0.95, (3, 2): 0.99, (3, 0): 0.75, (4, 3): 0.85}
-    links = {}
-    for (i, j), confidence in ends.items():
-        T = np.linalg.inv(poses[j]) @ poses[i]
-        T[:3, 3] += 3.0 * ((i, j) == (3, 0))  # the wrong one
-        links[i, j] = Link(i, j, "aligned", "look", [Hypothesis(T, confidence)], edge=0.05)
+def test_a_pose_that_follows_from_others_is_believed_where_neither_scan_lacks_a_thing(room, monkeypatch):
+    """Two scans of a room that no link joins: at the true pose, and at one where floors fit and walls don't."""
+    scans = [prepare(PointCloud(points)) for points in room[:2]]
     survey = SimpleNamespace(
-        links=links, edges=dict.fromkeys(range(5), 0.05), description=lambda n, edge: SimpleNamespace(moment=np.eye(4))
-    )
-    sure = sure_links(survey)
-    assert [link.ends for link in sure] == [(3, 2), (1, 0), (2, 0)]
-    [part] = parts(sure)
-    assert sorted(part) == [0, 1, 2, 3]
-    for i in part:
-        T = np.linalg.inv(part[0]) @ part[i]
-        np.testing.assert_allclose(T, np.linalg.inv(poses[0]) @ poses[i], atol=1e-9)
+        links={}, edges=dict.fromkeys(range(2), 0.05), options=Options(), frames=[s.frame for s in scans],
+        description=lambda n, edge: SimpleNamespace(moment=np.eye(4)),
+        store=SimpleNamespace(prepared=scans.__getitem__),
+    )  # fmt: skip
+    true = np.eye(4)
+    true[:3, 3] = scans[0].centre - scans[1].centre
+    beside = true.copy()
+    beside[:3, 3] += 0.1, 0.0, 0.0
+    found = settled(survey, 0, 1, true, 0.2)
+    assert found is not None
+    assert angle_degrees(np.array(found.T_target_source)) < 1
+    assert settled(survey, 0, 1, beside, 0.2) is None
+    monkeypatch.setattr("fmr_cli.training.self_registration.LACKING", 1.0)
+    assert settled(survey, 0, 1, beside, 0.2) is not None  # more speaks for it than against it: that is not enough
 
 
 @pytest.mark.slow
