@@ -93,7 +93,7 @@ def draw_path(figure: Any, drawn: Drawn, axes: Sequence[int]) -> None:
     if len(true):
         panel.plot(*true.T, color=TRUTH, linewidth=3.5, alpha=0.6, label="truth")
     if drawn.before is not None:
-        panel.plot(*drawn.before[:, (a, b), 3].T, color=PATH, linewidth=0.8, linestyle=":", label="before loops")
+        panel.plot(*drawn.before[:, (a, b), 3].T, color=LOOPS, linewidth=0.9, linestyle=":", label="before loops")
     panel.plot(*xy.T, color=PATH, label="path")
     for number, pair in enumerate(drawn.loops):
         panel.plot(*xy[list(pair)].T, color=LOOPS, marker="o", markerfacecolor="none", linewidth=1,
