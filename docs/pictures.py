@@ -16,11 +16,14 @@ from matplotlib.figure import Figure
 from fmr_cli import align, align_many, read_cloud, read_transform
 from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.evaluation.heldout import Setting, draw, errors
+from fmr_cli.evaluation.truth import read_truth
 from fmr_cli.feature_metric.encoder import Encoder
 from fmr_cli.feature_metric.solver import make_template, solve
 from fmr_cli.registration.models import bundled_encoder, load_encoder
+from fmr_cli.report.sequence_picture import write_picture
+from fmr_cli.sequence import SequenceOptions, align_sequence, find_scans
 from fmr_cli.synthetic.batches import Pairs
-from fmr_cli.synthetic.examples import write_building
+from fmr_cli.synthetic.examples import write_building, write_drive
 from fmr_cli.synthetic.shapes import others
 
 FOLDER = Path(__file__).parent / "pictures"
@@ -134,13 +137,26 @@ def error_by_iteration(encoder: Encoder, pairs: Pairs, iterations: int, robust: 
     return found
 
 
-PICTURES: dict[str, Callable[[], Figure]] = {f.__name__: f for f in (hero, building, anchors, convergence)}
+def drive() -> None:
+    """The drive of the tutorial, as `fmr sequence --truth` draws it."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_drive(Path(folder), 60, SEED)
+        options, scans = SequenceOptions(), find_scans(Path(folder))
+        truth = read_truth(Path(folder) / "poses.txt", scans.chosen, scans.total)
+        write_picture(FOLDER / "drive.png", align_sequence(scans, None, options), scans, options, truth)
+
+
+PICTURES: dict[str, Callable[[], Figure | None]] = {
+    f.__name__: f for f in (hero, building, anchors, convergence, drive)
+}
 
 
 def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     for name in sys.argv[1:] or PICTURES:
-        PICTURES[name]().savefig(FOLDER / f"{name}.png", dpi=110)
+        figure = PICTURES[name]()  # or it has written the picture itself, in the style of the tool's own
+        if figure is not None:
+            figure.savefig(FOLDER / f"{name}.png", dpi=110)
         print(FOLDER / f"{name}.png")
 
 

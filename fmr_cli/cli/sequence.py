@@ -11,12 +11,24 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from fmr_cli.cli.console import UNCERTAIN, busy, progress, say, show_log
-from fmr_cli.cli.options import Quiet, Report, Topic, Verbose, check_report, takes_registration_options
+from fmr_cli.cli.options import (
+    PICTURES,
+    Quiet,
+    Report,
+    Topic,
+    Verbose,
+    check_picture,
+    check_report,
+    takes_registration_options,
+)
 from fmr_cli.registration.options import Options
 
 if TYPE_CHECKING:
     import numpy as np
     from rich.progress import Progress
+
+    from fmr_cli.evaluation.truth import Truth
+    from fmr_cli.sequence.scans import Scans
 
 
 @partial(takes_registration_options, names=("model",))
@@ -58,7 +70,10 @@ def sequence_command(
         typer.Option("--deskew/--no-deskew", help="Undo the motion within each scan; done if its points have times."),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="True poses (KITTI, TUM, .npy): errors and a plot beside --out.")
+        Path | None, typer.Option(help="True poses (KITTI, TUM, .npy): errors, and a picture, beside --out.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Path over the map, height, sigmas, status, errors: .png, .pdf, .svg.")
     ] = None,
     start: Annotated[int, typer.Option(help="The first scan, counted from 0.", min=0)] = 0,
     stop: Annotated[int | None, typer.Option(help="The scan before which to stop; none if not given.", min=0)] = None,
@@ -78,10 +93,13 @@ def sequence_command(
 
     show_log(verbose)
     check_report(report)
-    outputs.check_outputs([(out, (out.suffix.lower(),)), (residuals, (".csv",)), (merged, io.WRITABLE)])
+    check_picture(picture)
+    outputs.check_outputs([
+        (out, (out.suffix.lower(),)), (residuals, (".csv",)), (merged, io.WRITABLE), (picture, PICTURES),
+    ])  # fmt: skip
     found = find_scans(with_topic(scans, topic), start, stop, step, [path for path in (out, residuals, merged) if path])
     say(*found.notes, quiet=quiet)
-    true = read_truth(truth, found) if truth else None
+    true = read_truth(truth, found, quiet) if truth else None
     chosen = SequenceOptions(
         format=form, camera_frame=camera_frame, voxel_size=voxel_size or None, merged_voxel=merged_voxel or None,
         loop_closure=loop_closure, deskew=deskew, model=options.model,
@@ -98,17 +116,25 @@ def sequence_command(
 
             write_sequence(report, result, found, chosen)
     say(*result.summary(), quiet=quiet)
-    if true is not None:
+    if true:
         compare(result.poses, true, out, quiet)
+    if picture or true:
+        with busy("drawing the picture", quiet):
+            from fmr_cli.report.sequence_picture import write_picture
+
+            write_picture(picture or out.with_suffix(".png"), result, found, chosen, true)
     if result.status != "aligned":
         raise typer.Exit(UNCERTAIN)
 
 
-def read_truth(path: Path, found: Any) -> np.ndarray:
-    """(n, 4, 4): the true poses of the chosen scans. Raises FmrError before anything is registered."""
-    from fmr_cli.evaluation import trajectory
+def read_truth(path: Path, found: Scans, quiet: bool) -> Truth:
+    """The true poses of the chosen scans. Raises FmrError before anything is registered."""
+    from fmr_cli.evaluation import truth
 
-    return trajectory.read_truth(path, found.chosen, found.total, found.times)
+    true = truth.read_truth(path, found.chosen, found.total, found.times)
+    if true.note:
+        say(true.note, quiet=quiet)
+    return true
 
 
 def follow(bar: Progress, quiet: bool) -> Callable[[dict[str, Any], int, int], None]:
@@ -128,13 +154,11 @@ def follow(bar: Progress, quiet: bool) -> Callable[[dict[str, Any], int, int], N
     return on_row
 
 
-def compare(poses: np.ndarray, true: np.ndarray, out: Path, quiet: bool) -> None:
-    """Errors against the truth, and a plot, beside ``out``."""
+def compare(poses: np.ndarray, true: Truth, out: Path, quiet: bool) -> None:
+    """Errors against the truth, said and written beside ``out``."""
     from fmr_cli.evaluation import trajectory
     from fmr_cli.io import outputs
-    from fmr_cli.report.trajectory import plot_paths
 
-    errors = trajectory.evaluate(poses, true)
+    errors = trajectory.evaluate(true.beside(poses), true.poses)
     outputs.write_json(out.with_suffix(".evaluation.json"), errors)
-    plot_paths(out.with_suffix(".png"), poses, true)
     say(*trajectory.summary(errors), quiet=quiet)

@@ -82,10 +82,15 @@ def picture(clouds: list[tuple[np.ndarray, tuple[int, int, int]]], plane: Plane,
     return data_uri(Image.fromarray(image).quantize(16))
 
 
-def ground(xy: np.ndarray, box: np.ndarray, side: int = 900) -> str:
-    """Points (N, 2) within ``box`` (2, 2), low and high, as a grey picture of their density on a clear ground."""
+def ground(xy: np.ndarray, box: np.ndarray) -> str:
+    """Points (N, 2) within ``box`` (2, 2), low and high, as a grey picture of their density, a PNG's data URI."""
     from PIL import Image
 
+    return data_uri(Image.fromarray(density(xy, box)).quantize(12))
+
+
+def density(xy: np.ndarray, box: np.ndarray, side: int = 900) -> np.ndarray:
+    """(h, w, 4) uint8, the longer side so many pixels: grey on a clear ground, the denser the points the less clear."""
     size = box[1] - box[0]
     width, height = np.maximum((size / size.max() * side).astype(int), 1)
     column, row = ((xy - box[0]) / size * [width, height]).astype(int).T
@@ -95,7 +100,7 @@ def ground(xy: np.ndarray, box: np.ndarray, side: int = 900) -> str:
     most = np.quantile(count[count > 0], 0.98) if inside.any() else 1.0
     image = np.full((height, width, 4), 128, np.uint8)
     image[..., 3] = np.where(count > 0, 60 + 160 * np.minimum(count / most, 1), 0)
-    return data_uri(Image.fromarray(image).quantize(12))
+    return image
 
 
 def data_uri(image: Any) -> str:

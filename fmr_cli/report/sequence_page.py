@@ -64,6 +64,11 @@ def in_scanner_frame(
     """(n, 4, 4): the poses of the scans, also where those of the camera were asked for."""
     poses = result.odometry_poses if odometry else result.poses
     assert poses is not None
+    return of_scanner(poses, scans, options)
+
+
+def of_scanner(poses: np.ndarray, scans: Scans, options: SequenceOptions) -> np.ndarray:
+    """Poses (n, 4, 4) of what the options ask for, the scanner or the camera, as the scanner's."""
     T = scans.T_camera_scan if options.camera_frame else None
     return poses if T is None else np.linalg.inv(T) @ poses @ T
 
@@ -86,22 +91,31 @@ def map_points(T_first_scan: np.ndarray, read: Read) -> np.ndarray:
     return np.concatenate([transform_points(T_first_scan[i], read(i)) for i in chosen])
 
 
+def above(seen: np.ndarray, centres: np.ndarray) -> tuple[list[int], int]:
+    """The two axes of the view of a path (n, 3) over the map (N, 3) from where both are broadest, and the third."""
+    axes = list(broad_side(np.concatenate([seen, centres])).axes)
+    return axes, next(a for a in range(3) if a not in axes)
+
+
+def box_about(seen: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """(2, 2): low and high about a path (n, 2) and all but the outermost points (N, 2) of the map, with a margin."""
+    low, high = np.quantile(np.concatenate([seen, centres]), [0.01, 0.99], axis=0)
+    low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
+    margin = 0.03 * float((high - low).max()) or 1.0  # one place alone has no size
+    return np.stack([low - margin, high + margin])
+
+
 def path_data(
     result: SequenceResult, T_first_scan: np.ndarray, before: np.ndarray | None, seen: np.ndarray
 ) -> dict[str, Any]:
     """What the page's scripts draw. The side view looks along the shorter side of the path seen from above."""
     centres = T_first_scan[:, :3, 3]
-    whole = np.concatenate([seen, centres]) if len(seen) else centres
-    axes = list(broad_side(whole).axes)
-    up = next(a for a in range(3) if a not in axes)
+    axes, up = above(seen, centres)
     along = axes[int(np.argmax(np.ptp(centres[:, axes], axis=0)))]
     names = ("frame", "status", "file", "inlier_rmse", "sigma_shift", "sigma_rotation_deg", "overlap", "unobserved")
     views = []
     for name, pair in (("above" if up == 2 else f"along {'xyz'[up]}", axes), ("side", [along, up])):
-        low, high = np.quantile(whole[:, pair], [0.01, 0.99], axis=0)
-        low, high = np.minimum(low, centres[:, pair].min(0)), np.maximum(high, centres[:, pair].max(0))
-        margin = 0.03 * float((high - low).max())
-        box = np.stack([low - margin, high + margin])
+        box = box_about(seen[:, pair], centres[:, pair])
         views.append({
             "name": name, "axes": ["xyz"[a] for a in pair], "box": box.tolist(), "xy": centres[:, pair].tolist(),
             "before": None if before is None else before[:, :3, 3][:, pair].tolist(),

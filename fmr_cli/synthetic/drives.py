@@ -174,6 +174,7 @@ def streets(rng: np.random.Generator, a: float, b: float) -> tuple[Scene, np.nda
             x, end = -along / 2 + (10 if inner else -16), along / 2 - (10 if inner else -16)
             while x < end:
                 front, depth, height = rng.uniform(5, 14), rng.uniform(3, 6), rng.uniform(2, 6)
+                front = min(front, end - x)  # a last house that went on stood across the next street, on the way
                 y = offset + (1 if inner else -1) * (depth + rng.uniform(0, 2))
                 scene.add(CUBE, turned.apply([x + front / 2, y, height]), [front / 2, depth, height], turned)
                 x += front + rng.uniform(0.5, 6)

@@ -13,10 +13,12 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from simulation import turn_and_shift
 
 from fmr_cli import PointCloud, read_cloud, write_cloud
 from fmr_cli.cloud import angle_degrees
+from fmr_cli.evaluation.truth import Truth
 from fmr_cli.io import read_poses, write_poses
 
 FRAMES = 8  # of the street's drive
@@ -155,7 +157,7 @@ def test_killed_and_resumed_it_comes_to_the_same_poses(fmr, street, whole, tmp_p
     assert [row["frame"] for row in table(residuals)] == [str(i) for i in range(FRAMES)]
 
 
-def test_errors_against_the_truth_and_a_plot(fmr, street, tmp_path):
+def test_errors_against_the_truth_and_a_picture(fmr, street, tmp_path):
     pytest.importorskip("evo")
     folder, truth = street
     write_poses(tmp_path / "truth.txt", truth)
@@ -165,15 +167,59 @@ def test_errors_against_the_truth_and_a_plot(fmr, street, tmp_path):
     assert errors["frames"] == FRAMES // 2
     assert errors["ape_rmse_first_pose"] < 0.03
     assert "end drift" in done.stderr
-    assert (tmp_path / "p.png").stat().st_size > 1000
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_truth_of_another_length_is_one_line(fmr, street, tmp_path):
+def test_a_picture_of_scans_with_times_against_tum_of_fewer_poses(fmr, street, tmp_path):
+    """Scans at 10 Hz, named by their times; true poses between them, at 4 Hz, for the first half second alone."""
     pytest.importorskip("evo")
-    write_poses(tmp_path / "truth.txt", street[1][:3])
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for i in range(FRAMES):
+        (folder / f"{50 + i / 10:.1f}.bin").write_bytes((street[0] / f"{i}.bin").read_bytes())
+    at = np.array([0.5, 3.0, 5.5])  # frames
+    true = Truth(street[1][:3], at).beside(street[1])
+    rows = np.column_stack([50 + at / 10, true[:, :3, 3], Rotation.from_matrix(true[:, :3, :3]).as_quat()])
+    np.savetxt(tmp_path / "truth.tum", rows, fmt="%.6f")
+    done = fmr("sequence", folder, "--out", tmp_path / "p.tum", "--format", "tum", "--truth", tmp_path / "truth.tum",
+               "--picture", tmp_path / "seen.svg")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"3 true poses among {FRAMES} frames" in done.stderr
+    errors = json.loads((tmp_path / "p.evaluation.json").read_text())
+    assert errors["frames"] == 3
+    assert errors["ape_rmse_first_pose"] < 0.03
+    assert "error by length" in (tmp_path / "seen.svg").read_text("utf-8")
+    assert not (tmp_path / "p.png").exists()
+
+
+def test_a_picture_without_truth(fmr, street, tmp_path):
+    pytest.importorskip("matplotlib")
+    options = ("--stop", 3, "--picture", tmp_path / "seen.svg")
+    done = fmr("sequence", street[0], "--out", tmp_path / "p.txt", *options)
+    assert done.returncode == 0, done.stderr
+    text = (tmp_path / "seen.svg").read_text("utf-8")
+    assert "path over the map" in text
+    assert "error by length" not in text
+    done = fmr("sequence", street[0], "--out", tmp_path / "q.txt", "--picture", tmp_path / "seen.jpg")
+    assert done.returncode == 2
+    assert "cannot write the suffix '.jpg'" in done.stderr
+    assert not (tmp_path / "q.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("\n".join(3 * ["1 0 0 0 0 1 0 0 0 0 1 0"]), f"3 poses for {FRAMES} scans, give a row for each scan"),
+        ("\n".join(3 * ["1 2 3 4 5 6 7"]), "has 7 numbers a line; KITTI has 12, TUM 8"),
+    ],
+)
+def test_what_is_no_truth_of_these_scans_is_one_line(fmr, street, tmp_path, content, says):
+    pytest.importorskip("evo")
+    (tmp_path / "truth.txt").write_text(content)
     done = fmr("sequence", street[0], "--out", tmp_path / "p.txt", "--truth", tmp_path / "truth.txt")
     assert done.returncode == 2
-    assert f"3 poses for {FRAMES} scans" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert says in done.stderr
     assert not (tmp_path / "p.txt").exists()
 
 
