@@ -1,7 +1,7 @@
 """What a run has gained, as its user will see it: held-out pairs through ``align``, before and after.
 
 A model by which more pairs are lost than won is not kept, in all or, of one kind, by more than chance (one deviation of
-a fair coin); nor is one that calls more wrong poses ``aligned``. Where the verdict's confidence no longer holds on
+a fair coin); nor is one that calls more wrong poses ``aligned``, beyond chance. Where the confidence no longer holds on
 these pairs, it is brought in line.
 """
 
@@ -161,8 +161,7 @@ def outcome(ends: tuple[Prepared, Prepared], truth: np.ndarray, options: Options
 def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
     """Whether the model in ``path`` is worth keeping, and its verdict brought in line where it has to be."""
     weights, said, replaced = model(path).verdict, [], None
-    wrong = sum(c.before.aligned and not c.before.right for c in checked)
-    if not holds([c.after for c in checked]) or wrong_ones(c.after for c in checked) > wrong:
+    if not holds([c.after for c in checked]) or more_wrong(checked):
         slope, offset = in_line([c.after for c in checked])
         checked[:] = [replace(c, after=moved(c.after, slope, offset)) for c in checked]
         own = replace(weights, verdict=slope * weights.verdict)
@@ -178,14 +177,25 @@ def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
     all_won, all_lost = won_and_lost(checked)
     for name, some in groups(checked).items():
         won, lost = won_and_lost(some)
-        if lost - won > np.sqrt(won + lost) or (lost > won and all_lost > all_won):
+        if beyond_chance(lost, won) or (lost > won and all_lost > all_won):
             why = why or f"of {name}, {lost} pairs that were right no longer are, and {won} have come to be"
-    if wrong_ones(c.after for c in checked) > wrong:
+    if more_wrong(checked):
         why = why or "more wrong poses are called aligned than before"
     if why:
         kept = model(start).weights
         return Decision(False, weights_bytes(kept), [f"not kept: {why}; {path} holds the start"])
     return Decision(True, replaced, said)
+
+
+def beyond_chance(more: int, less: int) -> bool:
+    """Whether so many more are more than a fair coin gives."""
+    return bool(more - less > np.sqrt(more + less))
+
+
+def more_wrong(checked: list[Checked]) -> bool:
+    """Whether more wrong poses are called aligned than before, beyond chance."""
+    wrong = [tuple(o.aligned and not o.right for o in (c.before, c.after)) for c in checked]
+    return beyond_chance(wrong.count((False, True)), wrong.count((True, False)))
 
 
 def won_and_lost(checked: list[Checked]) -> tuple[int, int]:
