@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,9 @@ from fmr_cli.cores import usable_cores
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.se3 import exp, log
 from fmr_cli.io import read_cloud
-from fmr_cli.sequence.deskew import deskew, scan_times, time_span
+from fmr_cli.sequence.deskew import scan_times, time_span
 from fmr_cli.sequence.journal import Beginning
+from fmr_cli.sequence.moving_scan import MovingScan
 from fmr_cli.sequence.prepared_scan import PreparedScan, prepare_scan
 from fmr_cli.sequence.scans import Scans
 from fmr_cli.sequence.voxel_frame import VoxelFrame
@@ -38,12 +39,13 @@ SIZES_KEPT = 15  # scans before it that say what is usual
 class Loaded:
     """One scan as it came from its file.
 
-    scan: None where it cannot be used; the message in ``row`` says why. cloud: with its attributes, deskewed, where
-    the map needs it. size: mean absolute coordinate, voxels; 0 where there is none. row: its part of the table.
+    scan: None where it cannot be used; the message in ``row`` says why. moving: where it was deskewed. cloud: with its
+    attributes, where the map needs it, deskewed. size: mean absolute coordinate, voxels; 0 where there is none. row: its part of the table.
     """
 
     index: int
     scan: PreparedScan | None = None
+    moving: MovingScan | None = None
     cloud: PointCloud | None = None
     size: float = 0.0
     row: dict[str, Any] = field(default_factory=dict)
@@ -79,12 +81,12 @@ class Reading:
         """Thin the cloud, once no motion is left in it; begin: when work on it did."""
         cloud = loaded.cloud
         assert cloud
-        loaded.scan = prepare_scan(cloud.points, self.frame)
+        loaded.scan = loaded.moving.prepared() if loaded.moving else prepare_scan(cloud.points, self.frame)
         if loaded.scan is None:
             loaded.row["message"] = f"{cloud.name}: only {len(cloud)} points, too few to register"
         else:
             loaded.size = float(np.abs(loaded.scan.points).mean())
-        loaded.cloud = cloud if self.keep_clouds else None
+        loaded.cloud = cloud if self.keep_clouds and not loaded.moving else None
         loaded.row["prepare_s"] = round(time.perf_counter() - begin, 4)
 
 
@@ -130,8 +132,9 @@ class Loader:
     """The scans of a sequence, read and made ready.
 
     T_first_scan: the poses of the frames so far, (4, 4) each, file units; the list grows while the run goes on.
-    deskewed: undo the motion within each scan, by that between the two frames before it; in the first two scans, by
-    that which the run began with. keep_clouds: a map is made of the clouds.
+    deskewed: undo the motion within each scan: at first by that between the two frames before it, in the first two scans
+    by that which the run began with; once a scan is registered, by what ``within`` says of it. keep_clouds: a map is
+    made of the clouds.
     """
 
     def __init__(
@@ -141,6 +144,7 @@ class Loader:
         self.scans, self.beginning, self.T_first_scan = scans, beginning, T_first_scan
         self.deskewed, self.strict, self.keep_clouds = deskewed, strict, keep_clouds
         self.reading = Reading(beginning.frame, keep_clouds, whole_way=not deskewed)
+        self.within: dict[int, np.ndarray] = {}  # T_begin_end by frame, (4, 4), file units, of those registered
         self.usual_sizes: deque[float] = deque(maxlen=SIZES_KEPT)
         self.spans: dict[int, tuple[float, float] | None] = {}  # see ``time_span``, by frame
 
@@ -177,7 +181,9 @@ class Loader:
 
     def cloud(self, index: int) -> PointCloud:
         """A scan again with all its attributes, for the map."""
-        return self._without_motion(self.scans.read(index, attributes=True), index)
+        cloud = self.scans.read(index, attributes=True)
+        moving = self._moving(cloud, index) if self.deskewed else None
+        return moving.still() if moving else cloud
 
     def _undo_motion(self, loaded: Loaded) -> None:
         """Deskew a scan that was read, and make it ready; the frames before it must be known."""
@@ -186,27 +192,30 @@ class Loader:
         begin = time.perf_counter()
         self.spans[loaded.index] = time_span(loaded.cloud)
         try:
-            loaded.cloud = self._without_motion(loaded.cloud, loaded.index)
+            loaded.moving = self._moving(loaded.cloud, loaded.index)
         except CloudFileError as error:
             loaded.cloud, loaded.row["message"] = None, str(error)
             return
         self.reading.make_ready(loaded, begin)
 
-    def _without_motion(self, cloud: PointCloud, index: int) -> PointCloud:
-        """The scan deskewed, by constant velocity from the two frames before it, for as long as it lasts."""
-        if not self.deskewed:
-            return cloud
+    def _moving(self, cloud: PointCloud, index: int) -> MovingScan | None:
+        """The scan with its motion, by constant velocity until it is registered; None where it has no times."""
         try:
             times = scan_times(cloud)
         except CloudFileError:
             if self.strict:
                 raise
-            return cloud
-        T_begin_end = self.beginning.T_first_second
-        if index > 1:
-            T_begin_end = np.linalg.inv(self.T_first_scan[index - 2]) @ self.T_first_scan[index - 1]
-        T_begin_end = exp(self._share(index) * log(T_begin_end))
-        return replace(cloud, points=deskew(cloud.points, times, T_begin_end))
+            return None
+        share, T_begin_end = self._share(index), self.within.get(index)
+        if T_begin_end is None:
+            T_begin_end = exp(share * log(self._motion_before(index)))
+        return MovingScan(cloud, times, T_begin_end, share, self.beginning.frame)
+
+    def _motion_before(self, index: int) -> np.ndarray:
+        """T_before_last (4, 4), file units, of the two frames before this one; in the first two, as the run began."""
+        if index < 2:
+            return self.beginning.T_first_second
+        return np.linalg.inv(self.T_first_scan[index - 2]) @ self.T_first_scan[index - 1]
 
     def _share(self, index: int) -> float:
         """How long a scan lasts over the time from one to the next; 1 where times begin anew in each scan."""

@@ -159,6 +159,13 @@ class MotionModel:
         rotation, shift = (np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0)) for block in (C[:3, :3], C[3:, 3:]))
         return float(rotation), float(shift)
 
+    def information_within(self, share: float) -> np.ndarray:
+        """(6, 6), rad⁻² and voxels⁻²: how surely the motion within a scan is that from frame to frame.
+
+        share: how long the scan lasts over the time between frames.
+        """
+        return np.linalg.inv(share**2 * self._change())
+
     def _change(self) -> np.ndarray:
         """(6, 6), of a motion's change from one frame to the next."""
         return self._usual(self.changes, FIRST_CHANGE / self.radius, FIRST_CHANGE)

@@ -21,9 +21,11 @@ from fmr_cli.geometry.observability import about, in_frame, weak_twists
 from fmr_cli.registration.confidence import ALIGNED
 from fmr_cli.registration.options import Options
 from fmr_cli.sequence.feature_error import feature_errors
+from fmr_cli.sequence.inner_motion import without_motion
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
 from fmr_cli.sequence.motion_model import Expected, MotionModel, Told
+from fmr_cli.sequence.moving_scan import MovingScan
 from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
@@ -91,6 +93,7 @@ class Frame:
     unobserved: tuple[str, ...] = ()
     sigma_shift: float = 0.0
     sigma_rotation: float = 0.0
+    moving: MovingScan | None = None
 
 
 class Odometry:
@@ -112,7 +115,9 @@ class Odometry:
         self.best_total = np.inf  # of the fits since the last keyframe
         self.index = 0
 
-    def register(self, scan: PreparedScan | None, told: Told | None = None, pace: float = 1.0) -> Frame:
+    def register(
+        self, scan: PreparedScan | None, told: Told | None = None, pace: float = 1.0, moving: MovingScan | None = None
+    ) -> Frame:
         """The next frame; None stands for a scan that could not be used, and is bridged by the prediction.
 
         told: what is known of the motion from the frame before. pace: the time since then over that before it.
@@ -125,7 +130,11 @@ class Odometry:
         if scan is None:
             return self._bridge(index, None, expected, Fit(expected.T_map_scan, 0.0, np.nan, "prediction"))
         _, last, T_map_last = self.last
-        fit = self._best_fit(scan, expected)
+        fit = self._best_fit(scan, expected) if moving is None else self._first_look(scan, expected)
+        if moving and self._fits(fit):
+            information = self.motion.information_within(moving.share)
+            scan, moving = without_motion(self.map, scan, moving, fit, self._usual_slope(), information)
+            fit = self._best_fit(scan, expected)
         if self._fits(fit):
             fit = self._polished(scan, fit, expected)
             self._accept(index, scan, expected, fit)
@@ -133,7 +142,8 @@ class Odometry:
         else:
             frame = self._bridge(index, scan, expected, fit)
         T_last_scan = np.linalg.inv(T_map_last) @ self.motion.T_map_scan
-        return replace(frame, feature_errors=feature_errors(last, scan, T_last_scan, self.pair.model))
+        errors = feature_errors(last, scan, T_last_scan, self.pair.model)
+        return replace(frame, feature_errors=errors, moving=moving)
 
     def begin_in_map(self, scan: PreparedScan | None, T_map_guess: np.ndarray | None) -> Frame:
         """The first frame, in the known map: near a guess (4, 4), or found by registration.
@@ -201,6 +211,17 @@ class Odometry:
         if displacement(best.T_map_scan, T_map_features, scan.points) > FINE:
             return best if self._fits(best) else replace(by_features, T_map_scan=T_map_features, verified=True)
         return replace(best, verified=True)
+
+    def _first_look(self, scan: PreparedScan, expected: Expected) -> Fit:
+        """Where a scan is by the prediction, if that leads to the map at all: near enough to tell the motion within it."""
+        if self.aligned > TRUSTED_AFTER:
+            fit = self.map.fit(scan, expected.T_map_scan, (COARSE, FINE), "prediction", few=True)
+            if self._fits(fit):
+                return fit
+        return self._best_fit(scan, expected)
+
+    def _usual_slope(self) -> float:
+        return float(np.median(self.slopes)) if self.slopes else 0.0
 
     def _by_features(self, scan: PreparedScan) -> tuple[Registration, np.ndarray]:
         """The registration onto the last scan that could be used, and where that puts the scan in the map."""
@@ -270,7 +291,7 @@ class Odometry:
         all of it is observed.
         """
         assert self.motion
-        usual_slope = float(np.median(self.slopes)) if self.slopes else 0.0
+        usual_slope = self._usual_slope()
         found, (fit, slope) = fit, self.map.polish(scan, fit, usual_slope)
         if np.isfinite(slope):
             self.slopes.append(slope)

@@ -89,9 +89,11 @@ def align_sequence(
                 register = partial(odometry.begin_in_map, loaded.scan, priors.first())
             else:
                 told, pace = priors.motion(loaded.index), scans.pace(loaded.index)
-                register = partial(odometry.register, loaded.scan, told, pace)
+                register = partial(odometry.register, loaded.scan, told, pace, loaded.moving)
             frame, seconds = timed(register, scans.where(loaded.index))
             poses.append(frame.T_first_scan)
+            if frame.moving:
+                loader.within[loaded.index] = frame.moving.T_begin_end
             rows.append(loaded.row | described(frame, poses) | {"register_s": seconds})
             state = {"size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(), "state": odometry.state()}
             files.add(rows[-1], poses[-1], loaded.cloud, state)

@@ -12,8 +12,10 @@ import small_gicp
 from fmr_cli.cloud import transform_points
 from fmr_cli.geometry.kernels import NORMAL, geman_mcclure
 from fmr_cli.geometry.point_to_plane import linearise, normal_equations, step_motion
+from fmr_cli.geometry.se3 import adjoint, exp
 from fmr_cli.geometry.voxels import voxel_keys
-from fmr_cli.sequence.observability import Matches
+from fmr_cli.sequence.deskew import deskew
+from fmr_cli.sequence.observability import LEAST_SIGMA, Matches
 from fmr_cli.sequence.prepared_scan import PreparedScan
 
 REACH = 1.5  # a point's plane is sought within
@@ -21,9 +23,14 @@ FLAT = 0.8  # length of the mean normal, below which a voxel holds no plane
 AGREE = 0.7  # cosine between the normals of a point and of its plane
 ROUNDS, STEPS = 5, 2  # of looking up planes, at most, and of solving in between
 STILL = np.array([2e-4] * 3 + [1e-2] * 3)  # radians, voxels: a round that moves less is the last
+STILL_MOVING = 5 * STILL  # likewise where the motion within the scan is sought, which is then made ready anew
+MOVING_POINTS = 4_000  # of a scan, about, that tell the motion within it: it has six parameters more
 KERNEL = 3.0  # residuals beyond so many sigma weigh little (Geman-McClure)
 MIN_SIGMA = 0.01
 MIN_SPREAD = 0.3  # of log range, to tell how residuals grow with it
+# Of a residual's variance, by which residuals of neighbours are taken to count less than independent ones would: a plane
+# of the map that is off, is so for all points on it.
+SHARED = 10.0
 BANDS = 8  # of equal count by range from the sensor
 
 
@@ -68,27 +75,17 @@ class PlaneMap:
         from the planes, this scan's own slope, and what was matched; T as it was, NaN and None where too few points lie
         on planes.
         """
-        if self.tree is None:
-            self._settle()
-        assert self.tree
         solid = np.flatnonzero(scan.solid)
         points, normals = scan.points[solid].T.copy(), scan.normals[solid].T.copy()
         band, middle = bands(scan.ranges)
         band = band[solid]
         first = np.zeros(6)
         for _ in range(ROUNDS):
-            moved = T[:3, :3] @ points + T[:3, 3:]
-            found, squared = (column[:, 0] for column in self.tree.batch_knn_search(moved.T, 1))  # in arrays, not lists
-            plane = found.astype(np.int64)
-            facing, n = T[:3, :3] @ normals, self.normals.take(plane, 1)
-            cosine = np.einsum("in,in->n", n, facing)
-            agree = (np.abs(cosine) if self.two_sided else cosine) > AGREE
-            on = np.flatnonzero(agree & (squared < REACH**2) & self.flat[plane])
+            moved, facing = T[:3, :3] @ points + T[:3, 3:], T[:3, :3] @ normals
+            on, plane, n = self._partners(moved, facing)
             if len(on) < 6 * BANDS:
                 return T, float("nan"), float("nan"), None
-            n, moved, facing, plane = n.take(on, 1), moved.take(on, 1), facing.take(on, 1), plane[on]
-            if self.two_sided:
-                n *= np.sign(cosine[on])
+            moved, facing = moved.take(on, 1), facing.take(on, 1)
             r, J = linearise(moved.T, self.means.take(plane, 1).T, n.T, np.zeros(3))
             sigma = scale_by_band(np.abs(r), band[on])
             worth, scale2 = trust(sigma, slope)[band[on]], (KERNEL * sigma[band[on]]) ** 2
@@ -105,6 +102,59 @@ class PlaneMap:
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
         return T, rms, own, Matches(solid[on], moved.T, facing.T, n.T, weight / worth, rms)
+
+    def fit_moving(
+        self, scan: PreparedScan, T: np.ndarray, slope: float, information: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """The scan's pose near T, the motion that is left in it, and the RMS distance from the planes.
+
+        The motion is a twist (6,) over the time of the scan, scan axes, beside what it was deskewed by. information:
+        (6, 6), rad⁻² and voxel⁻², how sure it is that none is left.
+        """
+        assert scan.when is not None
+        solid = np.flatnonzero(scan.solid)
+        solid = solid[:: max(len(solid) // MOVING_POINTS, 1)]
+        points, normals, when = scan.points[solid], scan.normals[solid].T.copy(), scan.when[solid]
+        band = bands(scan.ranges)[0][solid]
+        twist, rms = np.zeros(6), float("nan")
+        first = np.zeros(12)
+        for _ in range(ROUNDS):
+            moved = T[:3, :3] @ deskew(points, when, exp(twist)).T + T[:3, 3:]
+            on, plane, n = self._partners(moved, T[:3, :3] @ normals)
+            if len(on) < 12 * BANDS:
+                break
+            r, J = linearise(moved.take(on, 1).T, self.means.take(plane, 1).T, n.T, np.zeros(3))
+            J = np.concatenate([J, (when[on] - 0.5) * J])
+            sigma = scale_by_band(np.abs(r), band[on])
+            worth, scale2 = trust(sigma, slope)[band[on]], (KERNEL * sigma[band[on]]) ** 2
+            to_scan = adjoint(np.linalg.inv(T))
+            for again in range(STEPS):
+                weight = worth * geman_mcclure(r * r, scale2)
+                rms = float(np.sqrt((weight * r * r).sum() / weight.sum()))
+                H, gradient = normal_equations(J, r, weight / (SHARED * max(rms, LEAST_SIGMA) ** 2))
+                H[6:, 6:] += to_scan.T @ information @ to_scan
+                gradient[6:] += to_scan.T @ information @ twist
+                step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(12), -gradient)
+                T, twist = step_motion(step[:6]) @ T, twist + to_scan @ step[6:]
+                r = r + step @ J
+                first = step if again == 0 else first
+            if (np.abs(first.reshape(2, 6)) < STILL_MOVING).all():
+                break
+        return T, twist, rms
+
+    def _partners(self, moved: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which of points (3, N) with normals (3, N), map axes, lie on planes: (n,), on which: (n,), whose normals (3, n)."""
+        if self.tree is None:
+            self._settle()
+        assert self.tree
+        found, squared = (column[:, 0] for column in self.tree.batch_knn_search(moved.T, 1))  # in arrays, not lists
+        plane = found.astype(np.int64)
+        n = self.normals.take(plane, 1)
+        cosine = np.einsum("in,in->n", n, facing)
+        agree = (np.abs(cosine) if self.two_sided else cosine) > AGREE
+        on = np.flatnonzero(agree & (squared < REACH**2) & self.flat[plane])
+        n = n.take(on, 1)
+        return on, plane[on], n * np.sign(cosine[on]) if self.two_sided else n
 
 
 def bands(ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ import small_gicp
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.normals import principal_variances, smallest_eigenvector
+from fmr_cli.geometry.voxels import voxel_keys
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 if TYPE_CHECKING:
@@ -55,14 +56,16 @@ class PreparedScan:
 
     ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``whole``: (M, 3) float32,
     the points before thinning; None once nobody will ask for them, since a map of whole scans would take too much
-    memory. It can be pickled until one of its clouds was asked for.
+    memory. It can be pickled until one of its clouds was asked for. ``when``: (N,), 0 to 1 over the scan, when the points
+    were measured, or None.
     """
 
-    def __init__(self, points: np.ndarray, sensor: np.ndarray) -> None:
-        """points: (M, 3) before thinning; sensor: (3,); both in voxels."""
+    def __init__(self, points: np.ndarray, sensor: np.ndarray, times: np.ndarray | None = None) -> None:
+        """points: (M, 3) before thinning; sensor: (3,); both in voxels. times: (M,), 0 to 1 over the scan."""
         self.whole: np.ndarray | None = points.astype(np.float32)
         # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
         self.points = np.array(small_gicp.voxelgrid_sampling(points, 1.0).points()[:, :3], order="C")
+        self.when = None if times is None else mean_by_voxel(points, times, self.points)
         tree = small_gicp.KdTree(self.points)
         self._scatter = scatter(self.points, neighbours(tree, self.points, NEIGHBOURS))
         self.normals = smallest_eigenvector(*self._scatter)[0]
@@ -147,6 +150,14 @@ class PreparedScan:
         return self.for_align if self.whole is None else prepare(PointCloud(self.whole.astype(float)))
 
 
+def mean_by_voxel(points: np.ndarray, values: np.ndarray, thinned: np.ndarray) -> np.ndarray:
+    """The mean value (N,) in the voxel of each of the thinned points (N, 3); values: (M,) of the points (M, 3)."""
+    keys, inverse = np.unique(voxel_keys(points, 1.0), return_inverse=True)
+    means = np.bincount(inverse, values) / np.bincount(inverse)
+    place = np.minimum(np.searchsorted(keys, voxel_keys(thinned, 1.0)), len(keys) - 1)  # rounding may leave a voxel
+    return means[place]
+
+
 def with_covariances(points: np.ndarray, count: int) -> small_gicp.PointCloud:
     """Points (N, 3) for small_gicp, with the covariance of each one's nearest, so many of them."""
     cloud = small_gicp.PointCloud(points)
@@ -178,11 +189,14 @@ def lines(six: np.ndarray) -> np.ndarray:
     return minors < LINE / (1 + LINE) ** 2 * (xx + yy + zz) ** 2
 
 
-def prepare_scan(points: np.ndarray, frame: VoxelFrame) -> PreparedScan | None:
-    """Points (N, 3), file units, made ready; None where too few are left. Safe in another thread."""
+def prepare_scan(points: np.ndarray, frame: VoxelFrame, times: np.ndarray | None = None) -> PreparedScan | None:
+    """Points (N, 3), file units, with their times (N,), 0 to 1, made ready; None where too few are left.
+
+    Safe in another thread.
+    """
     if len(points) < MIN_POINTS:
         return None
-    scan = PreparedScan(frame.points_to_voxels(points), frame.sensor)
+    scan = PreparedScan(frame.points_to_voxels(points), frame.sensor, times)
     return scan if len(scan) >= MIN_POINTS else None
 
 

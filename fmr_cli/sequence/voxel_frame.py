@@ -48,6 +48,14 @@ class VoxelFrame:
         T_first_scan[:3, 3] = self.voxel * T_map_scan[:3, 3] + self.of_map - T_map_scan[:3, :3] @ self.origin
         return T_first_scan
 
+    def twist_to_file(self, twist: np.ndarray) -> np.ndarray:
+        """A motion (6,) in a scan's axes, voxels to file units."""
+        return np.concatenate([twist[:3], self.voxel * twist[3:] - np.cross(twist[:3], self.origin)])
+
+    def twist_to_voxels(self, twist: np.ndarray) -> np.ndarray:
+        """The inverse of ``twist_to_file``."""
+        return np.concatenate([twist[:3], (twist[3:] + np.cross(twist[:3], self.origin)) / self.voxel])
+
     def pose_to_voxels(self, T_first_scan: np.ndarray) -> np.ndarray:
         """The inverse of ``pose_to_file``."""
         T_map_scan = T_first_scan.copy()
