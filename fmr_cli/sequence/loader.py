@@ -40,7 +40,8 @@ class Loaded:
     """One scan as it came from its file.
 
     scan: None where it cannot be used; the message in ``row`` says why. moving: where it was deskewed. cloud: with its
-    attributes, where the map needs it, deskewed. size: mean absolute coordinate, voxels; 0 where there is none. row: its part of the table.
+    attributes, where the map needs it and it was not. size: mean absolute coordinate, voxels; 0 where there is none.
+    row: its part of the table.
     """
 
     index: int
@@ -132,9 +133,9 @@ class Loader:
     """The scans of a sequence, read and made ready.
 
     T_first_scan: the poses of the frames so far, (4, 4) each, file units; the list grows while the run goes on.
-    deskewed: undo the motion within each scan: at first by that between the two frames before it, in the first two scans
-    by that which the run began with; once a scan is registered, by what ``within`` says of it. keep_clouds: a map is
-    made of the clouds.
+    deskewed: undo the motion within each scan: at first by that between the two frames before it, in the first two
+    scans by that which the run began with; once a scan is registered, by what ``within`` says of it. keep_clouds: a map
+    is made of the clouds.
     """
 
     def __init__(
@@ -174,7 +175,7 @@ class Loader:
         """A scan again, as it was registered. Raises FmrError where its file has changed."""
         loaded = self.reading(*self._scan_of(index))
         if self.deskewed:
-            self._undo_motion(loaded)
+            self._undo_motion(loaded)  # as it was registered, see ``within``
         if loaded.scan is None:
             raise FmrError(f"{self.scans.where(index)}: cannot be read again, it has changed; leave out --resume")
         return loaded.scan

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from fmr_cli.geometry.observability import about, in_frame, weak_twists
 from fmr_cli.registration.confidence import ALIGNED
 from fmr_cli.registration.options import Options
 from fmr_cli.sequence.feature_error import feature_errors
+from fmr_cli.sequence.frame import Frame
 from fmr_cli.sequence.inner_motion import without_motion
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, Fit, LocalMap, displacement
@@ -71,31 +72,6 @@ LOST_AFTER = 3  # uncertain frames in a row, after which the map is begun anew a
 ERRORS_KEPT, FITS_KEPT = 5, 15  # frames that running figures look back over
 
 
-@dataclass(frozen=True)
-class Frame:
-    """What came of one scan.
-
-    T_first_scan: (4, 4) float64, file units. status: "aligned", or "uncertain": the pose is then the prediction, and
-    the scan is kept out of the map. overlap: share of its points with a counterpart on the map. inlier_rmse: their
-    root mean square distance from the map's local planes, file units. start: where the accepted pose came from
-    ("first", "prediction", "zero-motion", "features"). feature_errors: see ``feature_error``, by the last usable scan.
-    unobserved: directions along which the scan does not tell its pose, in the first scan's axes ("shift along (1.00,
-    0.00, 0.00)"); there the pose is the prediction, and the frame "uncertain" once sigma_shift (file units) or
-    sigma_rotation (degrees), the pose's standard deviations along the worst direction, could matter.
-    """
-
-    T_first_scan: np.ndarray
-    status: str
-    overlap: float
-    inlier_rmse: float
-    start: str
-    feature_errors: tuple[float, float] | None = None
-    unobserved: tuple[str, ...] = ()
-    sigma_shift: float = 0.0
-    sigma_rotation: float = 0.0
-    moving: MovingScan | None = None
-
-
 class Odometry:
     """Registers scans, in their order, into the frame of the first one, or into that of a known map.
 
@@ -120,12 +96,13 @@ class Odometry:
     ) -> Frame:
         """The next frame; None stands for a scan that could not be used, and is bridged by the prediction.
 
-        told: what is known of the motion from the frame before. pace: the time since then over that before it.
+        told: what is known of the motion from the frame before. pace: the time since then over that before it. moving:
+        what the scan was made of, where it was deskewed; it is made anew as the motion within it becomes known.
         Raises RegistrationError where it is the first one.
         """
         index, self.index = self.index, self.index + 1
         if self.motion is None:
-            return self._begin(index, scan, np.eye(4))
+            return replace(self._begin(index, scan, np.eye(4)), moving=moving)
         expected = self.motion.expect(told, pace)
         if scan is None:
             return self._bridge(index, None, expected, Fit(expected.T_map_scan, 0.0, np.nan, "prediction"))
@@ -213,7 +190,7 @@ class Odometry:
         return replace(best, verified=True)
 
     def _first_look(self, scan: PreparedScan, expected: Expected) -> Fit:
-        """Where a scan is by the prediction, if that leads to the map at all: near enough to tell the motion within it."""
+        """Where a scan is by the prediction, if that leads to the map: near enough to tell the motion within it."""
         if self.aligned > TRUSTED_AFTER:
             fit = self.map.fit(scan, expected.T_map_scan, (COARSE, FINE), "prediction", few=True)
             if self._fits(fit):

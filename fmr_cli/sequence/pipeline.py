@@ -25,11 +25,12 @@ from fmr_cli.multiway.known import KnownPose
 from fmr_cli.multiway.pose_graph import check_installed
 from fmr_cli.registration.models import model
 from fmr_cli.sequence.deskew import scan_times
+from fmr_cli.sequence.frame import Frame
 from fmr_cli.sequence.journal import Beginning, Journal
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.loader import Loader
 from fmr_cli.sequence.loop_closure import close_loops
-from fmr_cli.sequence.odometry import Frame, Odometry
+from fmr_cli.sequence.odometry import Odometry
 from fmr_cli.sequence.options import SequenceOptions
 from fmr_cli.sequence.outputs import Outputs
 from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
@@ -92,11 +93,15 @@ def align_sequence(
                 register = partial(odometry.register, loaded.scan, told, pace, loaded.moving)
             frame, seconds = timed(register, scans.where(loaded.index))
             poses.append(frame.T_first_scan)
-            if frame.moving:
-                loader.within[loaded.index] = frame.moving.T_begin_end
             rows.append(loaded.row | described(frame, poses) | {"register_s": seconds})
-            state = {"size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(), "state": odometry.state()}
-            files.add(rows[-1], poses[-1], loaded.cloud, state)
+            moving = frame.moving or loaded.moving
+            if moving:
+                loader.within[loaded.index] = moving.T_begin_end
+            state = {
+                "size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(),
+                "T_begin_end": moving.T_begin_end.tolist() if moving else None, "state": odometry.state(),
+            }  # fmt: skip
+            files.add(rows[-1], poses[-1], moving.still() if moving and merged else loaded.cloud, state)
             if on_row:
                 on_row(rows[-1], len(rows), len(scans))
 
@@ -188,6 +193,7 @@ def go_on(
     T_map_scan = [np.array(line["T_map_scan"]) for line in done]
     rows.extend(line["row"] for line in done)
     poses.extend(odometry.frame.pose_to_file(T) for T in T_map_scan)
+    loader.within |= {i: np.array(line["T_begin_end"]) for i, line in enumerate(done) if line["T_begin_end"]}
     loader.usual_sizes.extend(line["size"] for line in done if line["size"])
     odometry.restore(done[-1]["state"], T_map_scan, loader.scan)
 
