@@ -67,7 +67,10 @@ def sequence_command(
     ] = False,
     deskew: Annotated[
         bool | None,
-        typer.Option("--deskew/--no-deskew", help="Undo the motion within each scan; done if its points have times."),
+        typer.Option(
+            "--deskew/--no-deskew",
+            help="Undo the motion within scans, by points' times or azimuth; by default if they tell.",
+        ),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="True poses (KITTI, TUM, .npy): errors, and a picture, beside --out.")

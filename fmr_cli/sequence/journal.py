@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from fmr_cli.errors import FmrError
 from fmr_cli.io.files import atomic_write, check_readable, reason
+from fmr_cli.sequence.azimuth import Revolution
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 
@@ -19,11 +20,26 @@ class Beginning:
     """What a run decides once, before its first frame.
 
     frame: the coordinates that the odometry works in. T_first_second: (4, 4), file units, the second frame to the first
-    as far as it is known before the run, for deskewing these two.
+    as far as it is known before the run, for deskewing these two. deskewed: whether the motion within scans is undone;
+    revolution: where points' times follow from their azimuth.
     """
 
     frame: VoxelFrame
     T_first_second: np.ndarray
+    deskewed: bool = False
+    revolution: Revolution | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "frame": self.frame.to_json(), "T_first_second": self.T_first_second.tolist(), "deskewed": self.deskewed,
+            "revolution": asdict(self.revolution) if self.revolution else None,
+        }  # fmt: skip
+
+    @classmethod
+    def from_json(cls, said: dict[str, Any]) -> Beginning:
+        revolution = Revolution(**said["revolution"]) if said["revolution"] else None
+        frame = VoxelFrame.from_json(said["frame"])
+        return cls(frame, np.array(said["T_first_second"]), said["deskewed"], revolution)
 
 
 class Journal:
@@ -59,16 +75,13 @@ class Journal:
             raise FmrError(
                 f"{self.path}: was begun with other settings ({', '.join(changed)}), use those or leave out --resume"
             )
-        return Beginning(VoxelFrame.from_json(header["frame"]), np.array(header["T_first_second"])), lines
+        return Beginning.from_json(header["beginning"]), lines
 
     def begin(self, beginning: Beginning, lines: list[dict[str, Any]]) -> None:
         """Write the header, and the lines of an earlier run again; opened for more."""
         if self.path is None:
             return
-        header = self.settings | {
-            "frame": beginning.frame.to_json(),
-            "T_first_second": beginning.T_first_second.tolist(),
-        }
+        header = self.settings | {"beginning": beginning.to_json()}
         with atomic_write(self.path) as part:
             part.write_text("".join(json.dumps(record) + "\n" for record in [header, *lines]), "utf-8")
         self.file = self.path.open("a", encoding="utf-8")

@@ -133,18 +133,18 @@ class Loader:
     """The scans of a sequence, read and made ready.
 
     T_first_scan: the poses of the frames so far, (4, 4) each, file units; the list grows while the run goes on.
-    deskewed: undo the motion within each scan: at first by that between the two frames before it, in the first two
-    scans by that which the run began with; once a scan is registered, by what ``within`` says of it. keep_clouds: a map
-    is made of the clouds.
+    The motion within each scan is undone, where ``beginning`` says so: at first by that between the two frames before
+    it, in the first two scans by that which the run began with; once a scan is registered, by what ``within`` says of
+    it. strict: a scan without times is an error then, else it is taken as it is. keep_clouds: a map is made of the
+    clouds.
     """
 
     def __init__(
-        self, scans: Scans, beginning: Beginning, T_first_scan: list[np.ndarray], *, deskewed: bool, strict: bool,
-        keep_clouds: bool,
-    ) -> None:  # fmt: skip
+        self, scans: Scans, beginning: Beginning, T_first_scan: list[np.ndarray], *, strict: bool, keep_clouds: bool
+    ) -> None:
         self.scans, self.beginning, self.T_first_scan = scans, beginning, T_first_scan
-        self.deskewed, self.strict, self.keep_clouds = deskewed, strict, keep_clouds
-        self.reading = Reading(beginning.frame, keep_clouds, whole_way=not deskewed)
+        self.deskewed, self.strict, self.keep_clouds = beginning.deskewed, strict, keep_clouds
+        self.reading = Reading(beginning.frame, keep_clouds, whole_way=not beginning.deskewed)
         self.within: dict[int, np.ndarray] = {}  # T_begin_end by frame, (4, 4), file units, of those registered
         self.usual_sizes: deque[float] = deque(maxlen=SIZES_KEPT)
         self.spans: dict[int, tuple[float, float] | None] = {}  # see ``time_span``, by frame
@@ -202,7 +202,7 @@ class Loader:
     def _moving(self, cloud: PointCloud, index: int) -> MovingScan | None:
         """The scan with its motion, by constant velocity until it is registered; None where it has no times."""
         try:
-            times = scan_times(cloud)
+            times = revolution.times(cloud.points) if (revolution := self.beginning.revolution) else scan_times(cloud)
         except CloudFileError:
             if self.strict:
                 raise
@@ -220,6 +220,8 @@ class Loader:
 
     def _share(self, index: int) -> float:
         """How long a scan lasts over the time from one to the next; 1 where times begin anew in each scan."""
+        if self.beginning.revolution:
+            return self.beginning.revolution.share
         earlier, later, own = (self._span(i) for i in (max(index, 1) - 1, max(index, 1), index))
         if earlier is None or later is None or own is None or not later[0] > earlier[0]:
             return 1.0

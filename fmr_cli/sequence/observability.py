@@ -41,7 +41,7 @@ class Matches:
 
     index: (N,), which points. moved: (N, 3), they, map axes. scan_normals, map_normals: (N, 3), unit, map axes, as each
     side sees the surface there. weight: (N,), robust, whatever their range. rms: of the distances between points and
-    planes.
+    planes, which are ``distance`` (N,), along the map's normals.
     """
 
     index: np.ndarray
@@ -50,6 +50,7 @@ class Matches:
     map_normals: np.ndarray
     weight: np.ndarray
     rms: float
+    distance: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ class SequenceOptions:
     voxel_size: a wish for the working voxel edge, which follows from the first scan's density, within a factor of 1.25.
     merged_voxel: the map's voxel edge, or None: half the working one.
     loop_closure: at the end, recognise places seen before and optimise the pose graph.
-    deskew: undo the motion within each scan, by the times of its points; its pose is that of the middle of the scan.
-    None: where the first scan's points have times.
+    deskew: undo the motion within each scan, by the times of its points, or by their azimuth; its pose is that of the
+    middle of the scan. None: where the first scan's points have times, or the scans show how a scanner turned.
     model: what ``fmr train`` has learnt (.safetensors), for the pairs that are registered on the way; None: bundled.
     Raises FmrError for a format that is not known, and for a voxel edge that is no positive number.
     """

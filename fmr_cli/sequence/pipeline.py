@@ -24,6 +24,7 @@ from fmr_cli.io import read_cloud
 from fmr_cli.multiway.known import KnownPose
 from fmr_cli.multiway.pose_graph import check_installed
 from fmr_cli.registration.models import model
+from fmr_cli.sequence.azimuth import Revolution, is_revolution, revolution
 from fmr_cli.sequence.deskew import scan_times
 from fmr_cli.sequence.frame import Frame
 from fmr_cli.sequence.journal import Beginning, Journal
@@ -66,16 +67,12 @@ def align_sequence(
     scans = as_scans(scans)
     known_cloud = read_cloud(known_map, attributes=False) if isinstance(known_map, Path) else known_map
     check(scans, options, out, resume, known_cloud)
-    strict = options.deskew is True  # else a later scan without times is taken as it is
-    options = replace(options, deskew=has_times(scans) if options.deskew is None else options.deskew)
     journal = Journal(out, settings(scans, options, init_poses or {}, known_cloud))
     beginning, done = (journal.read() if resume else None) or (begin(scans, options, known_cloud), [])
 
     rows: list[dict[str, Any]] = []
     poses: list[np.ndarray] = []  # T_first_scan of every frame so far; the loader deskews by the last two
-    loader = Loader(
-        scans, beginning, poses, deskewed=bool(options.deskew), strict=strict, keep_clouds=merged is not None
-    )
+    loader = Loader(scans, beginning, poses, strict=options.deskew is True, keep_clouds=merged is not None)
     known = KnownMap((known_cloud.points - beginning.frame.of_map) / beginning.frame.voxel) if known_cloud else None
     odometry, priors = Odometry(beginning.frame, known, options.pair), Priors(scans, init_poses or {}, beginning.frame)
     go_on(done, rows, poses, loader, odometry)
@@ -93,8 +90,9 @@ def align_sequence(
                 register = partial(odometry.register, loaded.scan, told, pace, loaded.moving)
             frame, seconds = timed(register, scans.where(loaded.index))
             poses.append(frame.T_first_scan)
-            rows.append(loaded.row | described(frame, poses) | {"register_s": seconds})
             moving = frame.moving or loaded.moving
+            undone = {"deskewed_by": "azimuth" if beginning.revolution else "times"} if moving else {}
+            rows.append(loaded.row | described(frame, poses) | undone | {"register_s": seconds})
             if moving:
                 loader.within[loaded.index] = moving.T_begin_end
             state = {
@@ -109,7 +107,9 @@ def align_sequence(
         if options.loop_closure:
             path, loops = close(path, rows, beginning.frame, loader, options)
         before = files.written(np.stack(poses)) if options.loop_closure else None
-        result = SequenceResult(files.written(path), rows, beginning.frame.voxel, before, len(loops), out, loops)
+        result = SequenceResult(
+            files.written(path), rows, beginning.frame.voxel, before, len(loops), out, loops, beginning.revolution
+        )
         files.finish(result, path, loader)
     return result
 
@@ -125,15 +125,6 @@ def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool
         check_installed("--loop-closure")
     if resume and (out is None or any(scans.path(i) is None for i in range(len(scans)))):
         raise FmrError("resume needs a file of poses, and scans in files; leave it out")
-
-
-def has_times(scans: Scans) -> bool:
-    """Whether the first scan's points have times that differ; what is wrong with it is said by whoever needs it."""
-    try:
-        scan_times(scans.read(0, attributes=True))
-    except CloudFileError:
-        return False
-    return True
 
 
 def settings(
@@ -155,15 +146,31 @@ def settings(
 def begin(scans: Scans, options: SequenceOptions, known_map: PointCloud | None) -> Beginning:
     """What follows from the first scan, and for deskewing from the first two. Raises CloudFileError."""
     try:
-        cloud = scans.read(0, attributes=bool(options.deskew))
+        cloud = scans.read(0, attributes=options.deskew is not False)
     except CloudFileError as error:
         raise CloudFileError(f"{error}; or leave this first scan out with --start") from None
-    if options.deskew:
-        scan_times(cloud)  # says before anything is written that points have no times
     origin = np.median(cloud.points, axis=0)
     map_origin = np.median(known_map.points, axis=0) if known_map else origin
     frame = VoxelFrame(choose_voxel(cloud.points, options.voxel_size, some_later(scans)), origin, map_origin)
-    return Beginning(frame, first_motion(scans, frame, options) if options.deskew else np.eye(4))
+    deskewed, revolution = times_of(scans, cloud, frame, options.deskew)
+    return Beginning(frame, first_motion(scans, frame, options) if deskewed else np.eye(4), deskewed, revolution)
+
+
+def times_of(scans: Scans, first: PointCloud, frame: VoxelFrame, wanted: bool | None) -> tuple[bool, Revolution | None]:
+    """Whether the motion within scans is to be undone, and by what where points have no times.
+
+    wanted: None: where it can be. Raises CloudFileError where it is wanted and nothing tells when points were measured.
+    """
+    if wanted is False:
+        return False, None
+    try:
+        scan_times(first)
+        return True, None
+    except CloudFileError as error:
+        found = revolution(scans, frame) if is_revolution(first) else None
+        if wanted and found is None:  # said before anything is written
+            raise CloudFileError(f"{error}; nor does their azimuth show any motion within the scans") from None
+        return found is not None, found
 
 
 def some_later(scans: Scans) -> Iterator[np.ndarray]:

@@ -101,7 +101,7 @@ class PlaneMap:
                 break
         spread = middle - middle.mean()
         own = float(spread @ np.log(sigma) / (spread @ spread)) if np.ptp(middle) > MIN_SPREAD else 0.0
-        return T, rms, own, Matches(solid[on], moved.T, facing.T, n.T, weight / worth, rms)
+        return T, rms, own, Matches(solid[on], moved.T, facing.T, n.T, weight / worth, rms, r)
 
     def fit_moving(
         self, scan: PreparedScan, T: np.ndarray, slope: float, information: np.ndarray
@@ -143,7 +143,7 @@ class PlaneMap:
         return T, twist, rms
 
     def _partners(self, moved: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which of points (3, N), with normals (3, N), map axes, lie on planes; on which; the planes' normals (3, n)."""
+        """Which of points (3, N), with normals (3, N), map axes, lie on planes; on which; and these planes' normals."""
         if self.tree is None:
             self._settle()
         assert self.tree

@@ -56,8 +56,8 @@ class PreparedScan:
 
     ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``whole``: (M, 3) float32,
     the points before thinning; None once nobody will ask for them, since a map of whole scans would take too much
-    memory. It can be pickled until one of its clouds was asked for. ``when``: (N,), when the points were measured, 0 to 1
-    over the scan, or None.
+    memory. It can be pickled until one of its clouds was asked for. ``when``: (N,), when the points were measured, 0 to
+    1 over the scan, or None.
     """
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray, times: np.ndarray | None = None) -> None:

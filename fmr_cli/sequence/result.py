@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from fmr_cli.sequence.azimuth import Revolution
+
 STRETCHES = 5  # that the summary tells of
 
 
@@ -21,7 +23,7 @@ class SequenceResult:
     unobserved (in words), and sigma_shift and sigma_rotation_deg, how far off the pose may be along them.
     voxel_size: the working voxel edge, file units. odometry_poses: (n, 4, 4) before loops were closed, or None where
     that was not asked for; loops: how many were closed; closed: the frames that each of them joins. out: the file of
-    poses, or None.
+    poses, or None. revolution: what points' times followed from, where they did from their azimuth.
     """
 
     poses: np.ndarray
@@ -31,6 +33,7 @@ class SequenceResult:
     loops: int = 0
     out: Path | None = None
     closed: tuple[tuple[int, int], ...] = ()
+    revolution: Revolution | None = None
 
     @property
     def status(self) -> str:
@@ -51,6 +54,8 @@ class SequenceResult:
         if self.odometry_poses is not None:
             before = f"; the path before: {odometry_path(self.out)}" if self.out else ""
             lines.append(f"{self.loops} loops closed{before}")
+        if self.revolution:
+            lines.append(str(self.revolution))
         if residuals:
             worst = max(self.rows[1:], key=lambda row: row.get("inlier_rmse", 0.0))
             lines.append(

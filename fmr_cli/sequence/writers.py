@@ -17,7 +17,7 @@ from fmr_cli.sequence.options import Format
 
 COLUMNS = (
     "frame", "file", "status", "start", "points", "overlap", "inlier_rmse", "feature_error_before",
-    "feature_error_after", "motion", "rotation_deg", "unobserved", "sigma_shift", "sigma_rotation_deg",
+    "feature_error_after", "motion", "rotation_deg", "unobserved", "sigma_shift", "sigma_rotation_deg", "deskewed_by",
     "read_s", "prepare_s", "register_s", "message",
 )  # fmt: skip
 

@@ -55,8 +55,8 @@ def test_one_time_for_all_points_is_an_error():
 def test_a_scan_may_last_less_than_the_time_to_the_next(begins, share):
     """0.1 s each, beginning so much later than the one before; 0: times begin anew in each scan."""
     scans = [PointCloud(np.zeros((50, 3)), {"time": 100.0 + begins * i + np.linspace(0, 0.1, 50)}) for i in range(3)]
-    beginning = Beginning(VoxelFrame(1.0, np.zeros(3)), np.eye(4))
-    loader = Loader(as_scans(scans), beginning, [], deskewed=True, strict=True, keep_clouds=False)
+    beginning = Beginning(VoxelFrame(1.0, np.zeros(3)), np.eye(4), deskewed=True)
+    loader = Loader(as_scans(scans), beginning, [], strict=True, keep_clouds=False)
     assert [loader._share(index) for index in range(3)] == pytest.approx([share] * 3)
 
 

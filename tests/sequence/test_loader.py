@@ -32,7 +32,7 @@ def loaders(street, monkeypatch):
     def make(*, apart):
         monkeypatch.setattr(loader, "WORTH_A_PROCESS", 2 if apart else 100)
         monkeypatch.setattr(loader, "usable_cores", lambda: 2)
-        return Loader(scans, beginning, [], deskewed=False, strict=False, keep_clouds=False)
+        return Loader(scans, beginning, [], strict=False, keep_clouds=False)
 
     return make
 

@@ -157,7 +157,7 @@ def planes(*normals, tilt=0.0, count=400):
         truth.append(np.tile(n, (count, 1)))
     n = np.concatenate(truth)
     sides = [m / np.linalg.norm(m, axis=1, keepdims=True) for m in (n + rng.normal(0, tilt, n.shape) for _ in "ab")]
-    return Matches(np.arange(len(n)), np.concatenate(points), *sides, np.ones(len(n)), 0.05)
+    return Matches(np.arange(len(n)), np.concatenate(points), *sides, np.ones(len(n)), 0.05, np.zeros(len(n)))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
@@ -183,7 +183,7 @@ def test_poses_aside_move_the_points_along_what_is_open_alone():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-5, 5, (4000, 2)), np.zeros(4000)])
     up = np.tile([0.0, 0.0, 1.0], (4000, 1))
-    seen = observe(Matches(np.arange(4000), points, up, up, np.ones(4000), 0.01), np.ones(4000), WRONG)
+    seen = observe(Matches(np.arange(4000), points, up, up, np.ones(4000), 0.01, np.zeros(4000)), np.ones(4000), WRONG)
     poses = seen.aside(np.eye(4), 2.0)
     assert len(poses) == 6  # to both sides along the two shifts and the rotation within the plane
     for T in poses:
