@@ -52,14 +52,13 @@ def drives() -> dict[str, Drive]:
     """Places and scanners; "skewed": the scanner moves while it scans, and the points' times are there."""
     hdl64, vlp16 = spinning(64, -24.8, 2.0, 900), spinning(16, -15, 15, 900, 60.0)
     hdl32 = spinning(32, -30, 10, 900, 60.0, sweep=0.1)
+    vlp16_skewed = spinning(16, -15, 15, 900, 60.0, sweep=0.1)
     return {
         "street64": drive(streets, (220, 120), hdl64, 10.0, 10.0, 1.1),
         "street32, skewed": drive(streets, (160, 100), hdl32, 10.0, 10.0, 1.1),
         "street16": drive(streets, (120, 80), vlp16, 6.0, 5.0, 1.1),
         "campus32, skewed": drive(campus, (120, 80), hdl32, 3.0, 2.0, 1.1, wobble=3.0),
-        "shaken16, skewed": drive(
-            streets, (80, 60), spinning(16, -15, 15, 900, 60.0, sweep=0.1), 0.5, 10.0, 1.1, wobble=12.0
-        ),
+        "shaken16, skewed": drive(streets, (80, 60), vlp16_skewed, 0.5, 10.0, 1.1, wobble=12.0),
         "campus64": drive(campus, (160, 100), hdl64, 8.0, 10.0, 1.1),
         "building16": drive(passages, (36, 24, 2.4, 0.0), vlp16, 1.2, 5.0, 1.1, wobble=1.0),
         "building, depth camera": drive(passages, (24, 16, 2.4, 0.0), depth_camera(), 0.8, 10.0, 1.1),

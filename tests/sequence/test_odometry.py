@@ -11,7 +11,7 @@ from degenerate import placed
 from simulation import drive, make_street, scan
 
 from fmr_cli.io import read_cloud, read_poses
-from fmr_cli.sequence import align_sequence, find_scans
+from fmr_cli.sequence import SequenceOptions, align_sequence, find_scans
 from fmr_cli.sequence.local_map import Fit, LocalMap
 from fmr_cli.sequence.odometry import Odometry
 from fmr_cli.sequence.prepared_scan import FITTED_POINTS, choose_voxel, prepare_scan
@@ -193,7 +193,7 @@ def few_of_each_frame(monkeypatch, scans):
     with monkeypatch.context() as patch:
         patch.setattr(LocalMap, "fit", told)
         patch.setattr(Odometry, "register", each)
-        align_sequence(scans)
+        align_sequence(scans, options=SequenceOptions(deskew=False))
     return calls[1:]
 
 
