@@ -30,10 +30,10 @@ PLACES, AT_A_PLACE, EVERY = 6, 4, 8
 STARTS = 24  # azimuths that a revolution may begin at: 15 deg apart
 SECTORS, FILLED = 36, 0.9  # a scan is a revolution if it has points in so large a share of so many sectors
 LEAST_OVERLAP = 0.3  # of two scans, for them to count: skewed ones, a few metres apart
-# Of the time between scans, that a scan lasts by the places' median: every third of a scanner's, or all. It is told too
-# low where scans are so skewed that few points find partners: so the whole is tried, too. Set by hand with
-# KITTI's in sight, which are deskewed and tell 0.26.
-LEAST_SHARE = 0.3
+# Of the time between scans, that a scan lasts by the places' median, at least: eight made-up drives without skew say
+# 0.03 at most (street, campus, mine, warehouse; 16 to 64 beams). It is told too low where scans are so skewed that few
+# points find partners: so the whole is tried, too, and how much better the scans then fit decides.
+LEAST_SHARE = 0.06
 # The share by which scans must fit each other better for it, in the median of the places: more than another thinning
 # does; and in how many of the places they must fit better at all: one in six may be registered wrongly.
 LEAST_GAIN, MOST = 0.02, 0.8
