@@ -64,4 +64,5 @@ def roughness(points: np.ndarray, wide: int) -> Roughness:
     far = planes_through(some, tree, wide)[2]
     growth = float(np.median(far / np.maximum(near, 1e-300)))
     wider = wide / NEAR  # in area; with noise n and a crease's deviation c: near² = n² + c², far² = n² + wider c²
-    return Roughness(share, growth, deviation * float(np.sqrt(np.clip((wider - growth**2) / (wider - 1), 0, 1))))
+    # A product: growth is endless where neighbours lie together, and the square of that an OverflowError.
+    return Roughness(share, growth, deviation * float(np.sqrt(np.clip((wider - growth * growth) / (wider - 1), 0, 1))))

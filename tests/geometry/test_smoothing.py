@@ -40,3 +40,10 @@ def test_points_come_nearer_to_the_surface() -> None:
     off = [np.abs(np.linalg.norm(points, axis=1) - 1).mean() for points in (noisy, put)]
     assert off[1] < 0.5 * off[0]
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
+
+
+def test_points_that_lie_together_have_no_noise() -> None:
+    """The deviation grows from nothing: no square of that is too large for a number."""
+    found = roughness(np.repeat(ball(0.05)[:400], 10, axis=0), 30)
+    assert found.growth > 1e200
+    assert found.noise == 0
