@@ -47,6 +47,7 @@ class Fit:
     the local variance, halved. start: the initial guess it came from. rms: distance of those points from the map's
     planes, voxels, NaN before ``LocalMap.polish``; seen: which directions are observed, None before it, and where too
     few points lie on planes to tell. verified: the registration onto the scan before has shown that it is right.
+    doubtful: it has leapt to here by local features, and that registration would not vouch for it.
     """
 
     T_map_scan: np.ndarray
@@ -56,6 +57,7 @@ class Fit:
     rms: float = float("nan")
     seen: Observability | None = None
     verified: bool = False
+    doubtful: bool = False
 
     @property
     def total(self) -> float:

@@ -181,7 +181,10 @@ class Odometry:
         if not sure:
             # A leap that nothing vouches for: a passage's corner fits another one in several ways.
             clearly = CLEARLY if self.usual and not self._usual(by_features) else 1.0
-            return by_features if clearly * by_features.total < best.total else best
+            if clearly * by_features.total >= best.total:
+                return best
+            leapt = all(displacement(by_features.T_map_scan, fit.T_map_scan, scan.points) > FINE for fit in fits)
+            return replace(by_features, doubtful=leapt)
         best = min(best, by_features, key=lambda fit: fit.total)
         if not self._fits(best):
             best = by_features
@@ -380,13 +383,14 @@ class Odometry:
         """What came of a scan that fits."""
         assert self.motion
         T_first_scan = self.frame.pose_to_file(fit.T_map_scan)
-        found = Frame(T_first_scan, "aligned", fit.overlap, fit.rms * self.frame.voxel, fit.start)
+        status = "uncertain" if fit.doubtful else "aligned"
+        found = Frame(T_first_scan, status, fit.overlap, fit.rms * self.frame.voxel, fit.start)
         if fit.seen is None or fit.seen.observed.all():
             return found
         rotation, shift = self.motion.sigma(fit.seen.centre)
         unclear = max(rotation * fit.seen.radius, shift) > MATTERS
         return replace(
-            found, status="uncertain" if unclear else "aligned",
+            found, status="uncertain" if unclear else status,
             unobserved=tuple(fit.seen.unobserved),
             sigma_shift=shift * self.frame.voxel, sigma_rotation=float(np.degrees(rotation)),
         )  # fmt: skip

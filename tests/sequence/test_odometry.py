@@ -77,7 +77,24 @@ def test_a_leap_that_registration_is_not_sure_of_has_to_fit_clearly_better(turni
     # A door stands before the scanner: nothing fits well, and another place hardly better.
     fits = {"features": Fit(elsewhere, overlap, 1.0, "features")}
     monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name, **_: fits.get(name, Fit(T, 0.35, 1.0, name)))
-    assert odometry._best_fit(prepare_scan(scans[5], frame), odometry.motion.expect(None, 1.0)).start == start
+    found = odometry._best_fit(prepare_scan(scans[5], frame), odometry.motion.expect(None, 1.0))
+    assert found.start == start
+    assert odometry._frame(found).status == ("uncertain" if start == "features" else "aligned")  # whatever it fits
+
+
+def test_what_registration_is_not_sure_of_is_no_leap_where_the_motion_led_there_too(turning, monkeypatch):
+    scans = turning[0]
+    frame = VoxelFrame(choose_voxel(scans[0]), np.median(scans[0], axis=0))
+    odometry = Odometry(frame)
+    for points in scans[:5]:
+        odometry.register(prepare_scan(points, frame))
+    expected = odometry.motion.expect(None, 1.0)
+    unsure = SimpleNamespace(status="uncertain"), expected.T_map_scan
+    monkeypatch.setattr(odometry, "_by_features", lambda scan: unsure)
+    fits = {"features": Fit(expected.T_map_scan, 0.9, 1.0, "features")}
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name, **_: fits.get(name, Fit(T, 0.35, 1.0, name)))
+    found = odometry._best_fit(prepare_scan(scans[5], frame), expected)
+    assert (found.start, odometry._frame(found).status) == ("features", "aligned")
 
 
 @pytest.fixture
