@@ -197,7 +197,7 @@ def main() -> None:
             found = way(pair)
             took = time.perf_counter() - begin
             best = max(found, key=lambda h: h.score) if found else Hypothesis(np.eye(4), name)
-            degrees, shift = pose_error(np.stack([best.T_target_source, refined(pair, roughly(pair, best))]), T)
+            degrees, shift = pose_error(np.stack([best.T_target_source, *refined(pair, roughly(pair, [best]))]), T)
             near = (degrees < (15, 5)) & (shift < np.array([6, 2]) * pair.edge)
             outcomes[name].append((*near, took))
     print(f"{'start':16s} pairs  found  refined  median s")
