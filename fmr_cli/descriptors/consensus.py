@@ -13,7 +13,6 @@ from fmr_cli.geometry.pose_error import angle_between
 
 SEEDS, NEIGHBOURS = 60, 20
 POWER_STEPS = 4  # of the leading eigenvector: the order of the seeds has settled by then
-REFITTED = 20  # seeds whose poses have the most inliers: they are refitted
 ROUNDS = 4  # of refitting a pose to its inliers
 BLOCK = 64  # rows of the matrix of agreement that are worked out at once: they stay in the processor's cache
 APART = 0.26  # rad: poses nearer than this and within two tolerances are one
@@ -50,7 +49,7 @@ def consensus(
 def poses_from_seeds(
     agree: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, motion: Motion, use: np.ndarray
 ) -> np.ndarray:
-    """A pose for each of the best seeds, fitted to its inliers: agree (C, C), 1 where two matches agree -> (S, 4, 4).
+    """A pose for each seed, fitted to its inliers: agree (C, C), 1 where two matches agree -> (S, 4, 4).
 
     use: (C,), 0 for matches that do not count.
     """
@@ -58,11 +57,9 @@ def poses_from_seeds(
     second = (agree[seeds] @ agree) * agree[seeds] * use
     members = np.argpartition(-second, min(NEIGHBOURS, len(source)) - 1, axis=1)[:, :NEIGHBOURS]
     T = motion.fit(source[members], target[members], np.take_along_axis(second, members, 1).astype(float))
-    near = residuals(T, source, target) < tolerance
-    near = near[np.argsort(-(near * use).sum(1), kind="stable")[:REFITTED]]
     for _ in range(ROUNDS):
-        T = motion.fit(source[None], target[None], (near + 1e-9) * use)
         near = residuals(T, source, target) < tolerance
+        T = motion.fit(source[None], target[None], (near + 1e-9) * use)
     return T
 
 
