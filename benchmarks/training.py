@@ -3,13 +3,14 @@
     python -m benchmarks.training building --out /tmp/place --minutes 10     # or street, object
     python -m benchmarks.training building --out /tmp/place --model m.safetensors --starts   # a model, cheaply
     python -m benchmarks.training ../shared/data/dragon --out /tmp/dragon --minutes 1        # scans and their poses
+    python -m benchmarks.training drive/ --halves --every 2 --out /tmp/drive --minutes 10    # a drive's two halves
 
 Sixty scans by a solid-state LiDAR (a square view of 70 deg, random directions, 1.5 cm of noise) or, of the object, a
 depth camera (6 mm, sparse), made once per --out, each in a frame of its own; or the scans of a folder, with a file
-NAME.pose.txt (4x4, scan to world) beside each. Trained on every other one without poses; tested on pairs among the
-others, drawn once, whose smaller share of overlap is 10 to 30, 30 to 60 % and more. Said of each band, before and
-after: pairs right (5 deg, and 2 % of the larger scan's size) with 95 % bounds (Wilson), `aligned`, wrong and yet
-`aligned`, right by the first consensus pose, the share of right matches, seconds.
+NAME.pose.txt (4x4, scan to world) beside each, or poses.txt. Trained on every other one, or on the first half, without
+poses; tested on pairs among the others, drawn once, whose smaller share of overlap is 10 to 30, 30 to 60 % and more.
+Said of each band, before and after: pairs right (5 deg, and 2 % of the larger scan's size) with 95 % bounds (Wilson),
+`aligned`, wrong and yet `aligned`, right by the first consensus pose, the share of right matches, seconds.
 """
 
 from __future__ import annotations
@@ -102,9 +103,16 @@ def ranged(scene: Scene, eye: np.ndarray, directions: np.ndarray, rng: np.random
     return points + away / np.linalg.norm(away, axis=1, keepdims=True) * rng.normal(0, NOISE, (len(points), 1))
 
 
-def posed(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The scans (n, 3) of a folder in its world's frame, in the order of their names, and T_scan_world of each."""
-    scans = scans_with_poses(folder)
+def posed(folder: Path, every: int, halves: bool) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The scans (n, 3) of a folder in its world's frame, and T_scan_world of each.
+
+    In the order of their names, one in ``every``; or with ``halves`` one of the first half and one of the second in
+    turn.
+    """
+    scans = scans_with_poses(folder)[::every]
+    half = len(scans) // 2
+    if halves:
+        scans = [scan for both in zip(scans[:half], scans[half:], strict=False) for scan in both]
     return [transform_points(T, read_cloud(file).points) for file, T in scans], [np.linalg.inv(T) for _, T in scans]
 
 
@@ -119,11 +127,12 @@ def made_up(kind: str, rng: np.random.Generator) -> tuple[list[np.ndarray], list
     return clouds, poses
 
 
-def make(kind: str, out: Path, seed: int) -> list[Case]:
+def make(kind: str, out: Path, seed: int, every: int = 1, halves: bool = False) -> list[Case]:
     """The scans in ``out``/learn and ``out``/test, made once, and all cases among the latter."""
     cases = out / "cases.json"
     if not cases.is_file():
-        clouds, poses = made_up(kind, np.random.default_rng(seed)) if kind in KINDS else posed(Path(kind))
+        rng = np.random.default_rng(seed)
+        clouds, poses = made_up(kind, rng) if kind in KINDS else posed(Path(kind), every, halves)
         names = [out / ("learn", "test")[n % 2] / f"scan_{n:03d}.ply" for n in range(len(clouds))]
         for name, points, T in zip(names, clouds, poses, strict=True):
             name.parent.mkdir(parents=True, exist_ok=True)
@@ -230,9 +239,11 @@ def main() -> None:
     parser.add_argument("--model", type=Path, nargs="*", default=[], help="models to test as they are")
     parser.add_argument("--pairs", type=int, default=200, help="of each band, at most")
     parser.add_argument("--starts", action="store_true", help="matches and the first consensus pose alone")
+    parser.add_argument("--every", type=int, default=1, help="of a folder, one scan in so many")
+    parser.add_argument("--halves", action="store_true", help="of a folder, learn from its first half")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    cases = make(given.kind, given.out, given.seed)
+    cases = make(given.kind, given.out, given.seed, given.every, given.halves)
     print({band: sum(low <= c.overlap < high for c in cases) for band, (low, high) in BANDS.items()})
     models: dict[str, Path | None] = {"before": None, **{m.stem if m.stem != "model" else m.parent.name: m
                                                          for m in given.model}}  # fmt: skip

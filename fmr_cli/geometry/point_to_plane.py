@@ -70,8 +70,8 @@ def with_scale(basis: np.ndarray, scale: bool) -> np.ndarray:
 class Normal:
     """The normal equations of point-to-plane at poses: A = Σ w JᵀJ and b = Σ w Jᵀr over the step (omega, v, log s).
 
-    A (..., 7, 7), b (..., 7). variance (...): of the weighted residuals, own unit
-    squared. count (...): correspondences.
+    A (..., 7, 7), b (..., 7). variance (...): of the weighted residuals, own unit squared. count (...): of
+    correspondences.
     """
 
     A: np.ndarray

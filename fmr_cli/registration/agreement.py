@@ -83,13 +83,11 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
     sought: all that contradicts it counts as missing, in one thing, and nothing as detail. Where one point in SOME says
     that plainly, the others are not asked.
     """
-    every = SOME
-    seen = both_ways(source, target, T_target_source, every)
-    sums = np.sum([way.sums for way in seen], 0)
-    if sums[1] <= PLAINLY * sums[0]:
-        every = 1
+    for every in (SOME, 1):
         seen = both_ways(source, target, T_target_source, every)
         sums = np.sum([way.sums for way in seen], 0)
+        if sums[1] > PLAINLY * sums[0]:
+            break
     denied, detail = sums[1] > sums[0], 0.0
     explained, contradicted = round(every * sums[0]), round(every * sums[1])
     missing = largest = contradicted if denied else 0

@@ -30,9 +30,9 @@ PLACES, AT_A_PLACE, EVERY = 6, 4, 8
 STARTS = 24  # azimuths that a revolution may begin at: 15 deg apart
 SECTORS, FILLED = 36, 0.9  # a scan is a revolution if it has points in so large a share of so many sectors
 LEAST_OVERLAP = 0.3  # of two scans, for them to count: skewed ones, a few metres apart
-# Of the time between scans, that a scan lasts by the places' median, at least: eight made-up drives without skew say
-# 0.03 at most (street, campus, mine, warehouse; 16 to 64 beams). It is told too low where scans are so skewed that few
-# points find partners: so the whole is tried, too, and how much better the scans then fit decides.
+# Of the time between scans, that a scan lasts by the places' median, at least. By hand: eight made-up drives without
+# skew say 0.03 at most (street, campus, mine, warehouse; 16 to 64 beams). It is told too low where scans are so skewed
+# that few points find partners: so the whole is tried, too, and how much better the scans then fit decides.
 LEAST_SHARE = 0.06
 # The share by which scans must fit each other better for it, in the median of the places: more than another thinning
 # does; and in how many of the places they must fit better at all: one in six may be registered wrongly.
@@ -88,9 +88,9 @@ def revolution(scans: Scans, frame: VoxelFrame) -> Revolution | None:
     if abs(share) < LEAST_SHARE:
         return None
     likely = [Revolution(float(starts[best]), share > 0, each) for each in (min(abs(share), 1.0), 1.0)]
-    gains = [np.array([place.gain(scans, frame, each) for place in found]) for each in likely]
-    which = int(np.argmax([np.median(gain) for gain in gains]))
-    gain = gains[which]
+    gains = np.array([place.gains(scans, frame, likely) for place in found])  # (places, likely)
+    which = int(np.argmax(np.median(gains, axis=0)))
+    gain = gains[:, which]
     return likely[which] if np.median(gain) > LEAST_GAIN and (gain > 0).mean() >= MOST else None
 
 
@@ -135,11 +135,15 @@ class Place:
             both -= (both * weight) @ J.T @ np.linalg.solve((J * weight) @ J.T, J)  # what another pose would do as well
             yield -(both[:-1] * weight) @ both[-1], (both[:-1] ** 2) @ weight
 
-    def gain(self, scans: Scans, frame: VoxelFrame, likely: Revolution) -> float:
-        """The share by which the scans' ``total`` falls once the motion within them is undone so."""
+    def gains(self, scans: Scans, frame: VoxelFrame, likely: list[Revolution]) -> list[float]:
+        """Of each, the share by which the scans' ``total`` falls once the motion within them is undone so."""
+        clouds = [scans.read(self.first + k, attributes=False) for k in range(len(self.scans))]
+        return [self.gain(clouds, frame, each) for each in likely]
+
+    def gain(self, clouds: list[PointCloud], frame: VoxelFrame, likely: Revolution) -> float:
+        """Of one; clouds: the scans as they were read."""
         still = []
-        for k, motion in enumerate(self.motions()):
-            cloud = scans.read(self.first + k, attributes=False)
+        for cloud, motion in zip(clouds, self.motions(), strict=True):
             T_begin_end = exp(frame.twist_to_file(likely.share * motion))
             scan = MovingScan(cloud, likely.times(cloud.points), T_begin_end, likely.share, frame).prepared()
             if scan is None:

@@ -75,6 +75,8 @@ class Journal:
             raise FmrError(
                 f"{self.path}: was begun with other settings ({', '.join(changed)}), use those or leave out --resume"
             )
+        if "beginning" not in header:
+            raise FmrError(f"{self.path}: was begun by another version of fmr, leave out --resume")
         return Beginning.from_json(header["beginning"]), lines
 
     def begin(self, beginning: Beginning, lines: list[dict[str, Any]]) -> None:

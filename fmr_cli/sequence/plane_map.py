@@ -90,8 +90,7 @@ class PlaneMap:
             sigma = scale_by_band(np.abs(r), band[on])
             worth, scale2 = trust(sigma, slope)[band[on]], (KERNEL * sigma[band[on]]) ** 2
             for again in range(STEPS):
-                weight = worth * geman_mcclure(r * r, scale2)
-                rms = float(np.sqrt((weight * r * r).sum() / weight.sum()))
+                weight, rms = weighed(r, worth, scale2)
                 H, gradient = normal_equations(J, r, weight)
                 step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -gradient)
                 T = step_motion(step) @ T
@@ -129,8 +128,7 @@ class PlaneMap:
             worth, scale2 = trust(sigma, slope)[band[on]], (KERNEL * sigma[band[on]]) ** 2
             to_scan = adjoint(np.linalg.inv(T))
             for again in range(STEPS):
-                weight = worth * geman_mcclure(r * r, scale2)
-                rms = float(np.sqrt((weight * r * r).sum() / weight.sum()))
+                weight, rms = weighed(r, worth, scale2)
                 H, gradient = normal_equations(J, r, weight / (SHARED * max(rms, LEAST_SIGMA) ** 2))
                 H[6:, 6:] += to_scan.T @ information @ to_scan
                 gradient[6:] += to_scan.T @ information @ twist
@@ -155,6 +153,12 @@ class PlaneMap:
         on = np.flatnonzero(agree & (squared < REACH**2) & self.flat[plane])
         n = n.take(on, 1)
         return on, plane[on], n * np.sign(cosine[on]) if self.two_sided else n
+
+
+def weighed(r: np.ndarray, worth: np.ndarray, scale2: np.ndarray) -> tuple[np.ndarray, float]:
+    """Robust weights (N,) of residuals r (N,), each of ``worth`` and with a squared scale, and their weighted RMS."""
+    weight = worth * geman_mcclure(r * r, scale2)
+    return weight, float(np.sqrt((weight * r * r).sum() / weight.sum()))
 
 
 def bands(ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

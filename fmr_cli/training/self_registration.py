@@ -37,8 +37,8 @@ from fmr_cli.registration.refinement import by_geometry, by_planes
 BANDS = {"small": (0.1, 0.3), "part": (0.3, 0.6), "much": (0.6, 1.01)}  # overlap; below, hardly a patch is in common
 BLOCK = 8  # scans in a row that are drawn together where there are too many: what follows each other overlaps
 STRIDES = (1, 2, 4, 8)  # between them: a spinning scanner's next scan shows nothing new
-# Of the points explained, that a thing which one scan lacks may have at a pose that follows from others': on made-up
-# buildings, one wrong link of alike rooms makes dozens of wrong poses; right ones lack less in 19 of 20 of a street.
+# Of the points explained, that a thing which one scan lacks may have at a pose that follows from others'. By hand: in a
+# made-up building one wrong link of alike rooms makes dozens of wrong poses; of a street 19 of 20 right ones lack less.
 LACKING = 0.01
 
 Show = Callable[[Progress], None]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -76,6 +78,10 @@ def test_a_run_begun_otherwise_is_not_gone_on_with(street, tmp_path):
         align_sequence(scans, tmp_path / "p.txt", on_row=cut_after(1))
     with pytest.raises(FmrError, match=r"begun with other settings \(voxel_size\)"):
         align_sequence(scans, tmp_path / "p.txt", SequenceOptions(voxel_size=1.0), resume=True)
+    header = json.loads((tmp_path / "p.txt.journal").read_text().splitlines()[0])
+    (tmp_path / "p.txt.journal").write_text(json.dumps({k: v for k, v in header.items() if k != "beginning"}) + "\n")
+    with pytest.raises(FmrError, match="begun by another version of fmr, leave out --resume"):
+        align_sequence(scans, tmp_path / "p.txt", resume=True)
     (tmp_path / "p.txt.journal").write_text("{\n")
     with pytest.raises(FmrError, match="is damaged"):
         align_sequence(scans, tmp_path / "p.txt", resume=True)
