@@ -16,7 +16,7 @@ from fmr_cli.synthetic.structures import Structure
 
 SENSORS = ("surface", "terrestrial", "lidar", "camera")
 ENOUGH = 12  # cells (1 / CELLS of a scan's size) that a detail covers in both scans, at least
-CONTRADICTING = 24  # cells of both scans' details, at least, that an alias takes to where nothing is
+CONTRADICTING = 24  # cells of both scans, at least, taken to where nothing is by a motion that is no alias
 SPREAD = 0.025  # least share of the common surface's normals along any direction: a bare wall and a floor have none
 LEAST = 40  # cells of the common surface
 SHARED = 0.3  # of the source that an alias has to lay on the target to be worth listing
@@ -93,10 +93,30 @@ def lands(structure: Structure, source: Scan, target: Scan) -> np.ndarray:
 
 
 def aliases(structure: Structure, source: Scan, target: Scan) -> list[np.ndarray]:
-    """The structure's symmetries that lay enough of the source on the target, the identity first."""
+    """The symmetries that lay enough of the source on the target and that no scan denies, the identity first."""
     shares = lands(structure, source, target)
     kept = [S for S, share in zip(structure.symmetries, shares, strict=True) if share >= min(SHARED, shares[0])]
+    kept = [S for S in kept if denied(structure, source, target, S) < CONTRADICTING]
     return [S @ turn for S in kept for turn in structure.turns]
+
+
+def denied(structure: Structure, source: Scan, target: Scan, S: np.ndarray) -> int:
+    """How many cells of either scan a motion S of the scene's frame takes to where the other scan saw nothing.
+
+    By the scene itself, without noise: into the other scan's view, off all solids by more than DIFFERENT, and not
+    behind any. That one sensor saw sides which the other one could not see denies no motion: they stood otherwise then.
+    """
+    size, count = min(source.size, target.size), 0
+    for one, other, T in ((source, target, S), (target, source, np.linalg.inv(S))):
+        x = transform_points(T, voxel_downsample(one.points, size / CELLS))
+        x = x[other.sees(x)]
+        x = x[sensors.clearance(structure.scene, x, structure.shells) > DIFFERENT * size]
+        if other.origin is not None and len(x):
+            off = x - other.origin
+            far = np.linalg.norm(off, axis=1)
+            x = x[structure.scene.cast(other.origin, off / far[:, None]) > far]
+        count += len(x)
+    return count
 
 
 def on_details(structure: Structure, points: np.ndarray) -> np.ndarray:

@@ -115,6 +115,27 @@ def inside(A: np.ndarray, kind: int, points: np.ndarray, grow: float = 0.0) -> n
     return near
 
 
+def clearance(scene: Scene, points: np.ndarray, shells: Sequence[int] = ()) -> np.ndarray:
+    """How far points (N, 3) are from all that is solid, negative within it: (N,).
+
+    Exact outside of cuboids, round cylinders and balls, less than that of oblong ones. shells: solids that are hollow.
+    """
+    least = np.full(len(points), np.inf)
+    for i, (kind, A) in enumerate(zip(scene.kinds, scene.maps, strict=True)):
+        half = np.linalg.norm(A[:3, :3], axis=0)
+        u = (points - A[:3, 3]) @ (A[:3, :3] / half)
+        if kind == CUBE:
+            off = np.abs(u) - half
+        elif kind == BALL:
+            off = (np.linalg.norm(u / half, axis=1, keepdims=True) - 1) * half.min()
+        else:
+            round_about = (np.linalg.norm(u[:, :2] / half[:2], axis=1) - 1) * half[:2].min()
+            off = np.column_stack([round_about, np.abs(u[:, 2]) - half[2]])
+        away = np.linalg.norm(np.maximum(off, 0), axis=1) + np.minimum(off.max(1), 0)
+        least = np.minimum(least, -away if i in shells else away)
+    return least
+
+
 def surface_scan(
     scene: Scene, rng: np.random.Generator, density: float, facing: np.ndarray | None = None, shells: Sequence[int] = ()
 ) -> Scan:

@@ -209,7 +209,9 @@ def corridor(rng: np.random.Generator, low: float, high: float, equal: bool) -> 
         return s
     turns = [np.eye(4)]
     if both:
-        turns.append(motion(about([0, 0, 1], 180), centre=[low + door[0] / 2, 0, 0]))
+        # About a door near the middle, so that the shifts reach all that are about another one.
+        middle = low + door[0] / 2 + period * round((high - low) / 2 / period)
+        turns.append(motion(about([0, 0, 1], 180), centre=[middle, 0, 0]))
     s.symmetries = products([motion(shift=[k * period, 0, 0]) for k in steps(int(15 / period))], turns)
     return s
 

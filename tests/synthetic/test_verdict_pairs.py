@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from fmr_cli.cloud import transform_points
 from fmr_cli.synthetic import repeating, sensors, structures
-from fmr_cli.synthetic.draft import Draft, Redraw, on_details
+from fmr_cli.synthetic.draft import CONTRADICTING, Draft, Redraw, denied, on_details
 from fmr_cli.synthetic.sensors import CELLS, overlap, surface_scan
 from fmr_cli.synthetic.structures import Structure
 from fmr_cli.synthetic.verdict_pairs import FAMILIES, KINDS, MAKERS, VerdictPair, fresh_pair, make_pair
@@ -176,6 +176,66 @@ def test_details_show_in_both_scans_and_contradict_every_alias(kind, monkeypatch
             moved = transform_points(S, details)
             away.append((tree.query(moved)[0] > size / 70).sum())
     assert min(away, default=99) >= 4  # the rest of the contradiction is the target's details, unseen by the source
+
+
+def drawn(kind: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Structure, Draft]:
+    """A pair of a kind that fits in several ways, and its structure."""
+    seen, keep = [], repeating.several
+
+    def noting(structure, source, target):
+        seen.append(structure)
+        return keep(structure, source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(repeating, "several", noting)
+        draft = draft_of(kind, seed)
+    return seen[-1], draft
+
+
+@pytest.mark.parametrize("kind", [*SEVERAL[:3], *(pytest.param(k, marks=pytest.mark.slow) for k in SEVERAL[3:])])
+def test_what_the_scans_show_tells_no_alias_from_the_truth(kind, monkeypatch):
+    structure, draft = drawn(kind, 1, monkeypatch)
+    aliases = draft.aliases[:: max(len(draft.aliases) // 40, 1)]
+    assert denied(structure, draft.source, draft.target, np.eye(4)) == 0
+    assert max(denied(structure, draft.source, draft.target, S) for S in aliases) < CONTRADICTING
+    off = structures.motion(shift=0.1 * draft.source.size * np.ones(3))  # no symmetry of any of them
+    assert denied(structure, draft.source, draft.target, off) > CONTRADICTING
+
+
+def test_stairs_turned_over_are_no_alias_where_the_other_scan_saw_air(monkeypatch):
+    """A zigzag is its own image under a half turn; what else was seen of the steps may not be."""
+    dropped = 0
+    for seed in range(6):
+        structure, draft = drawn("stairs, the middle", seed, monkeypatch)
+        turned = [S for S in structure.symmetries if S[1, 1] < 0]
+        over = [S for S in turned if denied(structure, draft.source, draft.target, S) >= CONTRADICTING]
+        assert not any(np.array_equal(S, T) for S in over for T in draft.aliases)
+        dropped += len(over)
+    assert dropped > 0
+
+
+def test_a_corridor_with_doors_on_both_sides_lists_it_turned_about_any_of_them(monkeypatch):
+    """Half a turn about the middle of what was seen lays it on itself, give or take half a period."""
+    both = 0
+    for seed in range(8):
+        structure, draft = drawn("corridor, doors at equal distances", seed, monkeypatch)
+        if not any(S[0, 0] < 0 for S in structure.symmetries):
+            continue
+        both += 1
+        period = min(abs(S[0, 3]) for S in structure.symmetries[1:] if S[0, 0] > 0)
+        middle = np.mean([(s.view[0][0] + s.view[1][0]) / 2 for s in (draft.source, draft.target)])
+        axes = [S[0, 3] / 2 for S in draft.aliases if S[0, 0] < 0]
+        assert min(abs(np.array(axes) - middle)) <= 0.251 * period  # axes are half a period apart
+    assert both > 1
+
+
+def test_clearance_is_the_distance_to_what_is_solid():
+    s = Structure()
+    s.box([0, 0, 0], [2, 1, 1])
+    s.add(2, [10, 0, 0], [1, 1, 3])
+    points = np.array([[3.0, 2, 0.5], [1, 0.5, 0.9], [10, 3, 1], [10, 0, 5], [10, 4, 7]])
+    np.testing.assert_allclose(sensors.clearance(s.scene, points), [2**0.5, -0.1, 2, 2, 5], atol=1e-12)
+    np.testing.assert_allclose(sensors.clearance(s.scene, points[1:2], shells=[0]), [0.1], atol=1e-12)
 
 
 def test_a_mirrored_room_has_no_right_pose(pairs):
