@@ -74,12 +74,15 @@ class Motion:
 
     def fit(self, source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """The weighted least squares motions: source, target (B or 1, n, 3), weight (B, n) -> (B, 4, 4)."""
-        weight = (weight / np.maximum(weight.sum(-1, keepdims=True), 1e-12))[:, None]  # [B x 1 x n]
-        a, b = weight @ source, weight @ target  # [B x 1 x 3]
         products = (target[..., :, None] * source[..., None, :]).reshape(*source.shape[:2], 9)
+        moments = np.concatenate([np.ones_like(source[..., :1]), source, target, products], -1)
+        # Of points that all share, one product: a batch of products with one row each takes several times as long.
+        sums = weight @ moments[0] if len(moments) == 1 else (weight[:, None] @ moments)[:, 0]
+        means = sums[:, 1:] / np.maximum(sums[:, :1], 1e-12)
+        a, b, products = means[:, :3], means[:, 3:6], means[:, 6:].reshape(-1, 3, 3)
         T = np.tile(np.eye(4), (len(weight), 1, 1))
-        T[:, :3, :3] = self.rotation((weight @ products).reshape(-1, 3, 3) - np.swapaxes(b, 1, 2) * a)
-        shift = (b - a @ np.swapaxes(T[:, :3, :3], 1, 2))[:, 0]
+        T[:, :3, :3] = self.rotation(products - b[:, :, None] * a[:, None])
+        shift = b - (T[:, :3, :3] @ a[:, :, None])[..., 0]
         if self.dof == "planar":
             shift = shift + (self.lift - shift @ self.up)[:, None] * self.up
         T[:, :3, 3] = shift

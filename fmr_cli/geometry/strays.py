@@ -72,27 +72,34 @@ def on_a_shell(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     if len(points) < LEAST:
         return none
     some = points[:: max(len(points) // SAMPLE, 1)]
-    distance = np.linalg.norm(some - np.median(some, axis=0), axis=1)
+    apart = length(some - np.median(some, axis=0))
     for share in SHELL_OUTER:
-        outer = some[distance >= np.quantile(distance, 1 - share)]
+        outer = some[apart >= np.quantile(apart, 1 - share)]
         outer = outer[rng.permutation(len(outer))[:SHELL_SAMPLE]]
-        drawn = [sphere(outer[rng.choice(len(outer), 4, replace=False)]) for _ in range(SHELL_DRAWS)]
-        centre, radius = max(drawn, key=lambda ball: on(outer, ball[0], ball[1], 2 * SHELL).sum())
-        near = on(outer, centre, radius, 2 * SHELL)
+        drawn = np.array([rng.choice(len(outer), 4, replace=False) for _ in range(SHELL_DRAWS)])
+        near = on(outer, *spheres(outer[drawn]), 2 * SHELL)
+        near = near[near.sum(1).argmax()]
         if near.sum() < len(outer) / 3:
             continue
         centre, radius = fitted_sphere(outer[near])
-        shell = on(points, centre, radius, SHELL)
-        rest = np.linalg.norm(points[~shell] - centre, axis=1) / radius
-        enough = shell.sum() >= SHELL_SHARE * len(points) and len(rest) >= len(points) / 20
-        if enough and np.quantile(rest, 0.99) < 1 / SHELL_GAP and rest.max() < 1 + 2 * SHELL:
+        distance = length(points - centre) / radius
+        shell = np.abs(distance - 1) < SHELL
+        if not SHELL_SHARE * len(points) <= shell.sum() <= len(points) * (1 - 1 / 20):
+            continue
+        rest = distance[~shell]
+        if np.quantile(rest, 0.99) < 1 / SHELL_GAP and rest.max() < 1 + 2 * SHELL:
             return shell
     return none
 
 
-def on(points: np.ndarray, centre: np.ndarray, radius: float, tolerance: float) -> np.ndarray:
-    """(N,) which points lie on a sphere, to within a share of its radius."""
-    return np.abs(np.linalg.norm(points - centre, axis=1) - radius) < tolerance * radius
+def on(points: np.ndarray, centre: np.ndarray, radius: np.ndarray, tolerance: float) -> np.ndarray:
+    """Which points (N, 3) lie on which spheres, centre (B, 3), radius (B,), to within a share of that: (B, N)."""
+    return np.abs(length(points - centre[:, None]) - radius[:, None]) < tolerance * radius[:, None]
+
+
+def length(x: np.ndarray) -> np.ndarray:
+    """|x| of vectors (..., 3): (...)."""
+    return np.sqrt(np.einsum("...i,...i->...", x, x))
 
 
 def fitted_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -103,10 +110,12 @@ def fitted_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
     return c[:3] + middle, float(np.sqrt(max(c[3] + c[:3] @ c[:3], 0.0)))
 
 
-def sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of the sphere through points (4, 3); 0 where they lie in one plane."""
-    A = 2 * (points[1:] - points[0])
-    if abs(np.linalg.det(A)) <= 1e-9 * np.prod(np.linalg.norm(A, axis=1)):
-        return points[0], 0.0
-    centre = np.linalg.solve(A, (points[1:] ** 2).sum(1) - (points[0] ** 2).sum())
-    return centre, float(np.linalg.norm(points[0] - centre))
+def spheres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (B, 3) and radii (B,) of the spheres through points (B, 4, 3); 0 where four lie in one plane."""
+    first, others = points[:, 0], points[:, 1:]
+    A = 2 * (others - first[:, None])
+    flat = np.abs(np.linalg.det(A)) <= 1e-9 * length(A).prod(1)
+    A[flat] = np.eye(3)
+    squares = (others**2).sum(2) - (first**2).sum(1)[:, None]
+    centre = np.where(flat[:, None], first, np.linalg.solve(A, squares[..., None])[..., 0])
+    return centre, np.where(flat, 0.0, length(first - centre))

@@ -86,7 +86,7 @@ def test_of_one_place_there_is_one_seed() -> None:
     source, target = matches(0.3, pose((1.0, -2.0, 0.4)))
     source, target = np.concatenate([source, source + 0.03]), np.concatenate([target, target - 0.03])
     agree = agreeing(source, target, TOLERANCE)
-    seeds = spread_seeds(agree, source, target, TOLERANCE, np.ones(len(source), np.float32))
+    seeds = spread_seeds(agree, source, target, TOLERANCE, np.ones(len(source), bool))
     assert len(seeds) == SEEDS
     same = (np.abs(source[seeds, None] - source[seeds]).max(-1) < TOLERANCE) & (
         np.abs(target[seeds, None] - target[seeds]).max(-1) < TOLERANCE
