@@ -26,10 +26,14 @@ def local_planes(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[np
 
 def planes_through(points: np.ndarray, tree: cKDTree, neighbours: int) -> tuple[np.ndarray, ...]:
     """``local_planes``, with the deviation (N,) and the distance of the farthest neighbour (N,) apart, own unit."""
-    distance, index = tree.query(points, min(neighbours, tree.n))
-    around = tree.data[index]
-    middle = around.mean(1)
-    x, y, z = np.moveaxis(around - middle[:, None], -1, 0)
+    return planes_of(points, tree.data, *tree.query(points, min(neighbours, tree.n)))
+
+
+def planes_of(points: np.ndarray, data: np.ndarray, distance: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``planes_through`` with neighbours that are known: their distances (N, k), nearest first, and rows of data."""
+    x, y, z = np.moveaxis(data[index], -1, 0)
+    middle = np.stack([x.mean(1), y.mean(1), z.mean(1)], 1)
+    x, y, z = (c - m[:, None] for c, m in zip((x, y, z), middle.T, strict=True))
     products = [np.einsum("ij,ij->i", a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))]
     normals, least = smallest_eigenvector(*products)
     deviation = np.sqrt(np.maximum(least, 0) / max(index.shape[1] - 3, 1))
@@ -57,11 +61,13 @@ def roughness(points: np.ndarray, wide: int) -> Roughness:
     """Of points (N, 3); wide: neighbours of a wide neighbourhood."""
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     some = points[:: max(len(points) // PROBES, 1)]
-    near, radius = planes_through(some, tree, NEAR)[2:]
+    # The nearest of a wide neighbourhood are the small one.
+    distance, index = tree.query(some, min(wide, tree.n))
+    near, radius = planes_of(some, points, distance[:, :NEAR], index[:, :NEAR])[2:]
     share, deviation = float(np.median(near / radius)), float(np.median(near))
     if wide >= tree.n:
         return Roughness(share, np.inf, 0.0)
-    far = planes_through(some, tree, wide)[2]
+    far = planes_of(some, points, distance, index)[2]
     growth = float(np.median(far / np.maximum(near, 1e-300)))
     wider = wide / NEAR  # in area; with noise n and a crease's deviation c: near² = n² + c², far² = n² + wider c²
     # A product: growth is endless where neighbours lie together, and the square of that an OverflowError.

@@ -119,7 +119,7 @@ def orbit(pair: Pair, T_target_source: np.ndarray, generators: list[np.ndarray],
     queue = [S @ T_target_source for S in generators]
     while queue and len(tried) <= ORBIT and len(found) < RIVALS:
         T = queue.pop(0)
-        if any(pair.same(T, other) for other in tried):
+        if pair.among(T, np.array(tried)):
             continue
         tried.append(T)
         score = pair.overlap_score(T)

@@ -17,6 +17,7 @@ from fmr_cli.errors import RegistrationError
 from fmr_cli.feature_metric.inverse_compositional import Template
 from fmr_cli.geometry.frames import Frame, enter_frames, leave_frames
 from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.pose_error import angle_between
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.registration.models import fast_encoder, local_encoder, solver
 from fmr_cli.registration.options import Options
@@ -105,12 +106,16 @@ class Pair:
         """The global feature F(P) of the target, and its Jacobian."""
         return self.encoder.template(self.sampled[1], self.threads)
 
+    @cached_property
+    def target_feature(self) -> np.ndarray:
+        """F(P) alone: its Jacobian, which the solver needs, costs half as much again."""
+        return self.encoder(self.sampled[1], self.threads)
+
     def feature_error(self, T_target_source: np.ndarray) -> float:
         """Mean |F(g Q) - F(P)| of the global feature at a pose."""
         g = self.enter_box(T_target_source).astype(np.float32)
-        return float(
-            np.abs(self.encoder(transform_points(g, self.sampled[0]), self.threads) - self.template.feature).mean()
-        )
+        moved = self.encoder(transform_points(g, self.sampled[0]), self.threads)
+        return float(np.abs(moved - self.target_feature).mean())
 
     # What local features say.
 
@@ -162,8 +167,14 @@ class Pair:
 
     def same(self, a: np.ndarray, b: np.ndarray) -> bool:
         """Whether two poses are one, but for what a refinement moves."""
-        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < DISTINCT_EDGES * self.edge  # asked first, since it is cheap
-        return bool(near) and angle_degrees(np.linalg.inv(a) @ b) < DISTINCT_DEGREES
+        return self.among(a, b[None])
+
+    def among(self, T: np.ndarray, others: np.ndarray) -> bool:
+        """Whether a pose (4, 4) is the ``same`` as one of others (n, 4, 4)."""
+        off = others[:, :3, 3] - T[:3, 3]
+        near = (off * off).sum(1) < (DISTINCT_EDGES * self.edge) ** 2
+        turned = angle_between(T[:3, :3], others[near, :3, :3]) if near.any() else np.empty(0)
+        return bool((turned < np.radians(DISTINCT_DEGREES)).any())
 
     def allowed(self, T_target_source: np.ndarray) -> bool:
         """Whether a pose keeps to the options' ``max_angle`` and ``max_shift``."""

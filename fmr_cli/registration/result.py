@@ -103,7 +103,8 @@ def describe(
     points = smaller(pair, best.T_target_source)
     centre = points.mean(0)
     twists = observability.weak_twists(observability.about(certain.information, centre), points - centre, in_use(pair))
-    twists = observability.unopposed(twists, pair.s, pair.t, best.T_target_source, centre)
+    if twists.size:  # of most pairs none is weak
+        twists = observability.unopposed(twists, pair.s, pair.t, best.T_target_source, centre)
     weak = observability.in_words(twists)
     aligned = best.confidence >= ALIGNED and not weak
     reasons = [f"the scans do not determine: {'; '.join(weak)}"] if weak else []
