@@ -94,12 +94,12 @@ def spread_seeds(
     seeds: list[int] = []
     for first in range(0, len(order), BLOCK):
         some = order[first : first + BLOCK]
-        free = ~near_each_other(places[some], places[seeds], tolerance).any(1)
+        taken = np.logical_or.reduce(near_each_other(places[some], places[seeds], tolerance), 1)
         near = near_each_other(places[some], places[some], tolerance)
         for i in range(len(some)):
-            if free[i]:
+            if not taken[i]:
                 seeds.append(int(some[i]))
-                free &= ~near[i]
+                taken |= near[i]
             if len(seeds) == SEEDS:
                 return np.array(seeds)
     return np.array(seeds)
@@ -139,7 +139,7 @@ def agreeing(source: np.ndarray, target: np.ndarray, tolerance: float) -> np.nda
 
 
 def distances(x: np.ndarray, count: int) -> np.ndarray:
-    """From the first ``count`` points to all: (C, 3) float32 -> (count, C); exact enough for what is about their mean."""
+    """From the first ``count`` points to all: (C, 3) float32 -> (count, C); exact enough about their mean."""
     squared = (x * x).sum(1)
     d2 = (-2 * x[:count]) @ x.T
     d2 += squared

@@ -30,12 +30,16 @@ def share_beyond_corner(points: np.ndarray, normals: np.ndarray, edge: float, rn
     x, n = points[some], normals[some]
     across = np.eye(3)  # onto what no plane so far has a normal along
     for _ in range(PLANES):
-        seeds = np.flatnonzero(np.linalg.norm(n @ across, axis=1) > ACROSS)[:SEEDS]  # they are in random order
+        rest = n @ across
+        seeds = np.flatnonzero(np.einsum("ni,ni->n", rest, rest) > ACROSS**2)[:SEEDS]  # they are in random order
         if len(seeds) < PLANES:
             break
-        off = np.abs(x @ n[seeds].T - np.einsum("ni,ni->n", x[seeds], n[seeds]))
-        along = (off < OFF * edge) & (np.abs(n @ n[seeds].T) > ALONG)
-        normal, on = plane(x, n, along[:, along.sum(0).argmax()], edge)
+        # A row a seed, whose points then lie one after the other
+        off = n[seeds] @ x.T
+        off -= np.einsum("ni,ni->n", x[seeds], n[seeds])[:, None]
+        cosine = n[seeds] @ n.T
+        along = (np.abs(off, out=off) < OFF * edge) & (np.abs(cosine, out=cosine) > ALONG)
+        normal, on = plane(x, n, along[np.count_nonzero(along, axis=1).argmax()], edge)
         x, n = x[~on], n[~on]
         new = across @ normal
         across = across - np.outer(new, new) / max(float(new @ new), 1e-12)
@@ -45,13 +49,16 @@ def share_beyond_corner(points: np.ndarray, normals: np.ndarray, edge: float, rn
 def plane(points: np.ndarray, normals: np.ndarray, about: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
     """The plane through points ``about`` (N,), as thick as its own points scatter: its normal (3,), what lies on it."""
     for _ in range(2):  # the second time without what stands out from it
-        middle = points[about].mean(0)
-        normal = np.linalg.eigh((points[about] - middle).T @ (points[about] - middle))[1][:, 0]
+        some = points[about]
+        middle = some.mean(0)
+        some -= middle
+        normal = np.linalg.eigh(some.T @ some)[1][:, 0]
         height = (points - middle) @ normal
         alike = (np.abs(height) < OFF * edge) & (np.abs(normals @ normal) > ALONG)
         layer = thickest(height[alike] if alike.any() else np.zeros(1), 2 * LEAST_OFF * edge)
         level = layer[len(layer) // 2]
-        sigma = NORMAL * np.median(np.abs(layer - level))
+        off = np.sort(np.abs(layer - level))
+        sigma = NORMAL * (off[(len(off) - 1) // 2] + off[len(off) // 2]) / 2
         on = np.abs(height - level) < np.clip(SIGMAS * sigma, LEAST_OFF * edge, OFF * edge)
         about = alike & on if (alike & on).sum() >= PLANES else about
     return normal, on

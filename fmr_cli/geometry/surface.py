@@ -18,21 +18,36 @@ from fmr_cli.geometry.voxels import voxel_downsample, voxel_keys
 BORDER = 1e-3  # surface variation that a lean of 1 counts as: below any bend, above the rounding of a plane
 MIRRORED = np.array([-1.0, 1.0, 1.0])  # what the mirror x = 0 makes of coordinates; any plane would do
 SPARSE = 4.0  # voxel edges: on a full surface 16 neighbours lie within 2.5
+Shape = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class Surface:
-    """A cloud on a voxel grid, with what its neighbourhoods say. points: (M, 3) own unit; edge: of the voxels."""
+    """A cloud on a voxel grid, with what its neighbourhoods say. points: (M, 3) own unit; edge: of the voxels.
+
+    What is worked out on first use by two surfaces side by side is no ``cached_property``: Python 3.11 has one lock for
+    all objects that share it.
+    """
 
     def __init__(self, points: np.ndarray, edge: float) -> None:
         self.edge = edge
         self.points = voxel_downsample(points, edge)
-        self.tree = cKDTree(self.points)
+        self._tree: cKDTree | None = None
+        self._known: Shape | None = None
 
-    @cached_property
-    def _shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        distance, index = neighbours(self.points, self.tree)
-        # Of the neighbours, the nearest 3 alone are kept: all of them are most of what a surface takes of memory.
-        return *normals_and_variation(self.points, distance, index), index[:, 1:4].copy()
+    @property
+    def tree(self) -> cKDTree:
+        """Of the points."""
+        if self._tree is None:
+            self._tree = cKDTree(self.points)
+        return self._tree
+
+    @property
+    def _shape(self) -> Shape:
+        if self._known is None:
+            distance, index = neighbours(self.points, self.tree)
+            # Of the neighbours, the nearest 3 alone are kept: all are most of what a surface takes of memory.
+            self._known = *normals_and_variation(self.points, distance, index), index[:, 1:4].copy()
+        return self._known
 
     @property
     def normals(self) -> np.ndarray:
@@ -65,9 +80,9 @@ class Surface:
         """The same surface in the mirror x = 0 of its own frame; what is known of its neighbourhoods stays."""
         image = copy(self)
         image.points = self.points * MIRRORED
-        image.tree = cKDTree(image.points)
+        image._tree = None
         normals, *others = self._shape
-        image.__dict__["_shape"] = (normals * MIRRORED, *others)
+        image._known = normals * MIRRORED, *others
         return image
 
     def keypoints(self, count: int, block: float | None = None) -> np.ndarray:

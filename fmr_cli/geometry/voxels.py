@@ -8,15 +8,37 @@ BITS = 21  # of a voxel's index along an axis: three times 21 fit an int64
 
 
 def voxel_downsample(points: np.ndarray, edge: float) -> np.ndarray:
-    """The mean of the points in each occupied voxel: (N, 3) -> (M, 3), in a fixed order (single-threaded).
+    """The mean of the points in each occupied voxel: (N, 3) -> (M, 3), by z, then y, then x.
 
-    In a unit near the edge: small_gicp takes none below a millionth. A power of two changes no bit of the result.
+    A voxel's corner is at the origin. What small_gicp's grid gives to rounding, in a third of the time.
     """
-    import small_gicp
+    if not len(points):
+        return points.copy()
+    rank = voxel_ranks(points, edge)
+    count = np.bincount(rank)
+    return np.stack([np.bincount(rank, c) for c in points.T], 1) / count[:, None]
 
-    unit = 2.0 ** np.ceil(np.log2(edge))
-    grid = small_gicp.voxelgrid_sampling(points / unit, edge / unit, num_threads=1)
-    return unit * np.asarray(grid.points())[:, :3]
+
+def voxel_ranks(points: np.ndarray, edge: float) -> np.ndarray:
+    """(N,) which voxel each of points (N, 3) lies in, the occupied ones counted from 0 by z, then y, then x."""
+    key, cell, cells, bits = np.zeros(len(points)), np.empty(len(points)), 1, len(points).bit_length()
+    for c in points.T[::-1]:  # the voxel's number in the points' box, exact below 2^53
+        np.floor(np.multiply(c, 1 / edge, out=cell), out=cell)
+        low = cell.min()
+        count = int(cell.max() - low) + 1
+        cells *= count
+        if cells >= 1 << min(53, 63 - bits):  # a box of so many voxels is empty but for a few
+            return np.unique(np.floor(points[:, ::-1] * (1 / edge)), axis=0, return_inverse=True)[1].reshape(-1)
+        key *= count
+        key += cell
+        key -= low
+    # Each point's own number in the last bits: to sort such numbers takes a fifth of the time of sorting by a key
+    packed = key.astype(np.int64) << bits | np.arange(len(points))
+    packed.sort()
+    voxel = packed >> bits
+    rank = np.empty(len(points), np.int64)
+    rank[packed & ((1 << bits) - 1)] = np.cumsum(np.diff(voxel, prepend=voxel[0]) != 0)
+    return rank
 
 
 def occupied_voxels(points: np.ndarray, edge: float) -> int:

@@ -6,8 +6,9 @@ target. ``enter_box`` and ``leave_box`` take them to the encoder's unit box and 
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.descriptors.matching import match
 from fmr_cli.errors import RegistrationError
 from fmr_cli.feature_metric.inverse_compositional import Template
+from fmr_cli.feature_metric.numpy_encoder import spread
 from fmr_cli.geometry.frames import Frame, enter_frames, leave_frames
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.pose_error import angle_between
@@ -48,7 +50,7 @@ class Pair:
         up /= np.linalg.norm(up)
         lift = float(up @ (source.centre - target.centre))  # what "planar" keeps of the shift between centred frames
         self.motion = Motion(options.dof, (float(up[0]), float(up[1]), float(up[2])), lift)
-        self.s, self.t = source.surface(edge), target.surface(edge)
+        self.s, self.t = self.both(lambda cloud: cloud.surface(edge))
         for cloud, surface in ((source, self.s), (target, self.t)):
             if len(surface.points) < MIN_POINTS:
                 what = f"fewer than {MIN_POINTS} voxels of {edge:.3g} hold points; lower --voxel-size"
@@ -58,6 +60,11 @@ class Pair:
                         "points; are they in one unit?"
                     )
                 raise RegistrationError(f"{cloud.name}: {what}")
+
+    def both(self, work: Callable[..., Any], *each: Sequence[Any]) -> list[Any]:
+        """What ``work`` gives of source and target, and of one of ``each``, side by side where two threads may."""
+        with spread(self.threads) as run:
+            return list(run(work, (self.source, self.target), *each))
 
     @property
     def flat_planes(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -121,8 +128,7 @@ class Pair:
 
     def describe(self) -> None:
         """Works out what concerns one cloud alone; both side by side where there are two threads for it."""
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(self.described, (self.source, self.target)))
+        self.both(self.described)
 
     def described(self, cloud: Prepared) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints of a cloud and their descriptors."""

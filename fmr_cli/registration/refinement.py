@@ -20,6 +20,7 @@ from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_pl
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.smoothing import NEAR, Roughness, local_planes
 from fmr_cli.geometry.surface import Surface
+from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.pair import RANKING_POINTS, Pair
 from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS
@@ -140,7 +141,8 @@ def common_points(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, 
     Where there are fewer than N, the rest have no normal, which faces along with nothing.
     """
     moved = transform_points(T_target_source, pair.s.points)
-    near = np.isfinite(pair.t.tree.query(moved, distance_upper_bound=COMMON_REACH * pair.edge)[0])
+    reach = COMMON_REACH * pair.edge
+    near = np.isfinite(pair.t.tree.query(moved, distance_upper_bound=reach, workers=pair.threads)[0])
     both = np.hstack([pair.s.points, pair.s.normals])
     some = [sample(both[here], PLANE_POINTS, np.random.default_rng(pair.seed)) for here in near]
     found = np.zeros((len(some), max(map(len, some)), 6))
@@ -151,7 +153,8 @@ def common_points(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, 
 
 def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     """The pose after GICP, or after point-to-plane within the options' motions and scale."""
-    s, t, edge = pair.source.fine(GICP_SOURCE, pair.edge), pair.target.fine(GICP_TARGET, pair.edge), pair.edge
+    edge = pair.edge
+    s, t = pair.both(lambda cloud, count: cloud.fine(count, edge), (GICP_SOURCE, GICP_TARGET))
     if pair.options.scale or pair.motion.dof != "rigid":
         return constrained(s, t, T_target_source, edge, pair.motion.basis(), pair.options.scale)
     T = gicp_in_reach(pair, s, pair.target.for_gicp(GICP_TARGET, edge, pair.threads), T_target_source)
@@ -179,8 +182,8 @@ def noisy(pair: Pair) -> bool:
 
 def roughnesses(pair: Pair) -> list[Roughness]:
     """Of source and target."""
-    clouds = ((pair.source, GICP_SOURCE), (pair.target, GICP_TARGET))
-    return [cloud.roughness(count, pair.edge, SMOOTHED_OVER) for cloud, count in clouds]
+    counts = GICP_SOURCE, GICP_TARGET
+    return pair.both(lambda cloud, count: cloud.roughness(count, pair.edge, SMOOTHED_OVER), counts)
 
 
 def by_smoothed(pair: Pair, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -203,9 +206,9 @@ def by_smoothed(pair: Pair, T_target_source: np.ndarray, source: np.ndarray, tar
 def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_source: np.ndarray) -> np.ndarray:
     """GICP of those of the source's points that are in reach of the target and face along with it."""
     moved, t = transform_points(T_target_source, source), pair.t
-    distance, beside = t.tree.query(moved, distance_upper_bound=GICP_REACH * pair.edge)
+    distance, beside = t.tree.query(moved, distance_upper_bound=GICP_REACH * pair.edge, workers=pair.threads)
     near = np.flatnonzero(np.isfinite(distance))
-    normals = pair.s.normals[pair.s.tree.query(source[near])[1]] @ T_target_source[:3, :3].T
+    normals = pair.s.normals[pair.s.tree.query(source[near], workers=pair.threads)[1]] @ T_target_source[:3, :3].T
     near = source[near[face_along(normals, t.normals[beside[near]])]]
     if len(near) < MIN_POINTS:
         return T_target_source
@@ -228,9 +231,9 @@ def exact(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
     fine = max(pair.edge / FINER, SPACINGS * source.spacing, SPACINGS * target.spacing)
     if min(len(source.points), len(target.points)) < EXACT_TARGET or fine > pair.edge / 2:
         return T
-    some = sample(source.surface(fine).points, GICP_SOURCE, np.random.default_rng(pair.seed))
-    whole = GicpCloud(target.surface(fine).points, fine, pair.threads)
-    return gicp(GicpCloud(some, fine, pair.threads), whole, T, fine)
+    s, t = pair.both(lambda cloud: voxel_downsample(cloud.points, fine))
+    some = sample(s, GICP_SOURCE, np.random.default_rng(pair.seed))
+    return gicp(GicpCloud(some, fine, pair.threads), GicpCloud(t, fine, pair.threads), T, fine)
 
 
 def in_common(pair: Pair, T_target_source: np.ndarray) -> bool:

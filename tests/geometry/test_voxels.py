@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from fmr_cli.geometry.voxels import voxel_keys
+from fmr_cli.geometry.voxels import voxel_downsample, voxel_keys
 
 
 def test_equal_keys_are_equal_voxels_in_the_order_of_their_indices() -> None:
@@ -13,6 +14,14 @@ def test_equal_keys_are_equal_voxels_in_the_order_of_their_indices() -> None:
     keys = voxel_keys(points, 0.5)
     by_cell, by_key = (np.unique(x, axis=0, return_inverse=True)[1].ravel() for x in (cells, keys))
     assert np.array_equal(by_cell, by_key)
+
+
+@pytest.mark.parametrize("far", [0.0, 1e15])  # so far off that the voxels of the box cannot be counted
+def test_the_grid_is_the_mean_of_each_voxel_by_z_then_y_then_x(far: float) -> None:
+    points = np.append(np.random.default_rng(0).uniform(-3, 3, (5000, 3)), [[far, 0.1, 0.1]], axis=0)
+    cells, rank = np.unique(np.floor(points[:, ::-1] / 0.5), axis=0, return_inverse=True)
+    means = [points[rank.ravel() == i].mean(0) for i in range(len(cells))]
+    np.testing.assert_allclose(voxel_downsample(points, 0.5), means, atol=1e-12)
 
 
 def test_a_voxel_far_away_meets_no_other() -> None:
