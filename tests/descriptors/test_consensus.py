@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from fmr_cli.cloud import transform_points
-from fmr_cli.descriptors.consensus import BLOCK, SEEDS, agreeing, consensus, spread_seeds
+from fmr_cli.descriptors.consensus import BLOCK, SEEDS, agreeing, consensus, spread_seeds, within
 from fmr_cli.descriptors.matching import match
 from fmr_cli.geometry.motion import Motion
 from fmr_cli.geometry.pose_error import angle_between
@@ -92,3 +92,26 @@ def test_of_one_place_there_is_one_seed() -> None:
         np.abs(target[seeds, None] - target[seeds]).max(-1) < TOLERANCE
     )
     assert np.array_equal(same, np.eye(SEEDS, dtype=bool))
+
+
+def test_matches_within_reach_are_those_with_small_residuals() -> None:
+    source, target = (x + 50.0 for x in matches(0.5, pose((1.0, -2.0, 0.4))))  # far from the origin
+    T = np.stack([pose((1.0, -2.0, 0.4)), np.eye(4)])
+    apart = np.linalg.norm(transform_points(T, source) - target, axis=2)
+    for tolerance in (0.03, 3.0):
+        assert np.array_equal(within(T, source, target, tolerance), apart < tolerance)
+
+
+def test_seeds_are_the_first_of_each_place_in_the_order_of_their_weight() -> None:
+    source, target = matches(0.3, pose((1.0, -2.0, 0.4)), 3 * BLOCK)
+    agree = agreeing(source, target, TOLERANCE)
+    use = np.arange(len(source)) % 4 > 0
+    seeds = spread_seeds(agree[use], source, target, 10 * TOLERANCE, use).tolist()
+    weight = use.astype(float)
+    for _ in range(4):
+        weight = (agree @ weight) * use
+    plain: list[int] = []
+    for i in np.argsort(-weight, kind="stable")[: use.sum()]:
+        near = [np.abs(x[i] - x[plain]).max(1, initial=0) < 10 * TOLERANCE for x in (source, target)]
+        plain += [] if (near[0] & near[1]).any() else [int(i)]
+    assert seeds == plain[:SEEDS]

@@ -102,3 +102,10 @@ def test_flat_matches_are_turned_not_mirrored() -> None:
     T = Motion().fit(x, y, np.ones((1, 20)))[0]
     np.testing.assert_allclose(np.linalg.det(T[:3, :3]), 1.0)
     np.testing.assert_allclose(transform_points(T, x[0]), y[0], rtol=0, atol=1e-9)
+
+
+def test_points_that_all_share_are_fitted_as_those_that_each_has() -> None:
+    rng = np.random.default_rng(5)
+    source, target, weight = rng.normal(size=(1, 9, 3)), rng.normal(size=(1, 9, 3)), rng.random((4, 9))
+    each = Motion().fit(np.repeat(source, 4, 0), np.repeat(target, 4, 0), weight)
+    np.testing.assert_allclose(Motion().fit(source, target, weight), each, atol=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fmr_cli.geometry.smoothing import local_planes, roughness
+from fmr_cli.geometry.smoothing import NEAR, PROBES, local_planes, planes_through, roughness
 
 
 def ball(noise: float) -> np.ndarray:
@@ -47,3 +47,9 @@ def test_points_that_lie_together_have_no_noise() -> None:
     found = roughness(np.repeat(ball(0.05)[:400], 10, axis=0), 30)
     assert found.growth > 1e200
     assert found.noise == 0
+
+
+def test_the_small_neighbourhoods_are_those_looked_up_by_themselves() -> None:
+    points = np.random.default_rng(4).normal(size=(2 * PROBES, 3)) * [1, 1, 0.05]
+    deviation, radius = planes_through(points[::2], cKDTree(points), NEAR)[2:]
+    assert roughness(points, 30).share == pytest.approx(np.median(deviation / radius))

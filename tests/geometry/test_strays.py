@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmr_cli.geometry.strays import strays
+from fmr_cli.geometry.strays import spheres, strays
 
 Scans = tuple[np.ndarray, np.ndarray]
 
@@ -39,3 +39,13 @@ def test_a_room_and_a_sphere_have_none(room_scans: Scans) -> None:
 
 def test_a_cloud_of_one_point_is_left_to_others() -> None:
     assert told(np.ones((500, 3)))[0].all()
+
+
+def test_spheres_go_through_their_points_and_four_in_a_plane_have_none() -> None:
+    points = np.random.default_rng(2).normal(size=(5, 4, 3))
+    points[3, :, 2] = 1.0
+    centre, radius = spheres(points)
+    apart = np.linalg.norm(points - centre[:, None], axis=2)
+    round_ = np.arange(5) != 3
+    np.testing.assert_allclose(apart[round_], np.repeat(radius[round_, None], 4, 1))
+    assert radius[3] == 0
