@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fmr_cli.cloud import PointCloud
-from fmr_cli.cores import usable_cores
 from fmr_cli.errors import CloudFileError, FmrError
 from fmr_cli.geometry.se3 import exp, log
 from fmr_cli.io import read_cloud
@@ -23,13 +19,11 @@ from fmr_cli.sequence.deskew import scan_times, time_span
 from fmr_cli.sequence.journal import Beginning
 from fmr_cli.sequence.moving_scan import MovingScan
 from fmr_cli.sequence.prepared_scan import PreparedScan, prepare_scan
+from fmr_cli.sequence.readers import Readers
 from fmr_cli.sequence.scans import Scans
 from fmr_cli.sequence.voxel_frame import VoxelFrame
-from fmr_cli.workers.local import Pool
 
 READ_AHEAD = 2  # scans that are read while one is registered: enough to hide the disk, few enough for the memory
-# Scans, from which a process is worth its start, which takes half a second of a core that else lies idle.
-WORTH_A_PROCESS = 16
 # A scan so many times larger or smaller than the usual one is not of this sequence: units differ by 10 or more.
 ODD_SIZE = 10.0
 SIZES_KEPT = 15  # scans before it that say what is usual
@@ -91,44 +85,6 @@ class Reading:
         loaded.row["prepare_s"] = round(time.perf_counter() - begin, 4)
 
 
-class Readers:
-    """A thread that works while this one registers, and where that gains time a process (small_gicp keeps the lock).
-
-    A context: it ends both. Who does a task changes no bit of it.
-    """
-
-    def __init__(self, apart: bool) -> None:
-        self.thread = ThreadPoolExecutor(1)
-        self.process = Pool(1) if apart else None
-        self.started = self.process.submit(start) if self.process else None
-
-    def __enter__(self) -> Readers:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.thread.shutdown(cancel_futures=True)
-        if self.process:
-            self.process.stop()
-
-    def hand_out(self, reading: Reading, *scan: Any) -> Callable[[], Loaded]:
-        """Have a scan read; returns what waits for it. Until the process has started, the thread does it."""
-        if self.process and self.started and self.started.done():
-            with suppress(BrokenExecutor):
-                future = self.process.submit(reading, *scan)
-                return partial(self._from_process, future, reading, *scan)
-        return self.thread.submit(reading, *scan).result
-
-    def _from_process(self, future: Future[Loaded], reading: Reading, *scan: Any) -> Loaded:
-        try:
-            return future.result()
-        except BrokenExecutor:  # it was killed, as for want of memory
-            return reading(*scan)
-
-
-def start() -> None:
-    """The first task of a process: when it is done, Python and what is imported here are there."""
-
-
 class Loader:
     """The scans of a sequence, read and made ready.
 
@@ -149,24 +105,19 @@ class Loader:
         self.usual_sizes: deque[float] = deque(maxlen=SIZES_KEPT)
         self.spans: dict[int, tuple[float, float] | None] = {}  # see ``time_span``, by frame
 
-    def ahead(self, start: int) -> Generator[Loaded, None, None]:
+    def ahead(self, start: int, readers: Readers) -> Iterator[Loaded]:
         """Each scan from index ``start`` on, read while those before it are registered."""
-        with Readers(apart=self._worth_a_process(len(self.scans) - start)) as readers:
-            waiting: deque[Callable[[], Loaded]] = deque()
-            for index in range(start, len(self.scans)):
-                for ahead in range(index + len(waiting), min(index + READ_AHEAD + 1, len(self.scans))):
-                    waiting.append(readers.hand_out(self.reading, *self._scan_of(ahead)))
-                loaded = waiting.popleft()()
-                if self.deskewed:  # only now, when the motion before it is known
-                    self._undo_motion(loaded)
-                self._refuse_odd_size(loaded)
-                yield loaded
-
-    def _worth_a_process(self, count: int) -> bool:
-        """Whether so many scans can be made ready where nothing of this process is known, and are enough for it."""
-        if count < WORTH_A_PROCESS or usable_cores() == 1 or self.deskewed or self.keep_clouds:
-            return False
-        return not any(isinstance(source, PointCloud) for source in self.scans.sources)  # they'd have to be sent there
+        if self.deskewed:  # then they are made ready here, and reading them needs no process
+            readers.without_process()
+        waiting: deque[Callable[[], Loaded]] = deque()
+        for index in range(start, len(self.scans)):
+            for ahead in range(index + len(waiting), min(index + READ_AHEAD + 1, len(self.scans))):
+                waiting.append(readers.hand_out(self.reading, *self._scan_of(ahead)))
+            loaded = waiting.popleft()()
+            if self.deskewed:  # only now, when the motion before it is known
+                self._undo_motion(loaded)
+            self._refuse_odd_size(loaded)
+            yield loaded
 
     def _scan_of(self, index: int) -> tuple[int, str, Path | PointCloud]:
         return index, self.scans.name(index), self.scans.sources[index]

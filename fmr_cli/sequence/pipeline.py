@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
@@ -36,6 +36,7 @@ from fmr_cli.sequence.options import SequenceOptions
 from fmr_cli.sequence.outputs import Outputs
 from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan
 from fmr_cli.sequence.priors import Priors
+from fmr_cli.sequence.readers import Readers, worth_a_process
 from fmr_cli.sequence.result import SequenceResult
 from fmr_cli.sequence.scans import Scans, as_scans
 from fmr_cli.sequence.voxel_frame import VoxelFrame
@@ -68,50 +69,54 @@ def align_sequence(
     known_cloud = read_cloud(known_map, attributes=False) if isinstance(known_map, Path) else known_map
     check(scans, options, out, resume, known_cloud)
     journal = Journal(out, settings(scans, options, init_poses or {}, known_cloud))
-    beginning, done = (journal.read() if resume else None) or (begin(scans, options, known_cloud), [])
+    earlier = journal.read() if resume else None
+    left = len(scans) - len(earlier[1] if earlier else [])
+    with Readers(apart=worth_a_process(scans, left, keep_clouds=merged is not None)) as readers:
+        beginning, done = earlier or (begin(scans, options, known_cloud), [])
 
-    rows: list[dict[str, Any]] = []
-    poses: list[np.ndarray] = []  # T_first_scan of every frame so far; the loader deskews by the last two
-    loader = Loader(scans, beginning, poses, strict=options.deskew is True, keep_clouds=merged is not None)
-    known = KnownMap((known_cloud.points - beginning.frame.of_map) / beginning.frame.voxel) if known_cloud else None
-    odometry, priors = Odometry(beginning.frame, known, options.pair), Priors(scans, init_poses or {}, beginning.frame)
-    go_on(done, rows, poses, loader, odometry)
+        rows: list[dict[str, Any]] = []
+        poses: list[np.ndarray] = []  # T_first_scan of every frame so far; the loader deskews by the last two
+        loader = Loader(scans, beginning, poses, strict=options.deskew is True, keep_clouds=merged is not None)
+        known = KnownMap((known_cloud.points - beginning.frame.of_map) / beginning.frame.voxel) if known_cloud else None
+        odometry = Odometry(beginning.frame, known, options.pair)
+        priors = Priors(scans, init_poses or {}, beginning.frame)
+        go_on(done, rows, poses, loader, odometry)
 
-    files = Outputs(
-        scans, options, journal, out=out, residuals=residuals, merged=merged, voxel=beginning.frame.voxel
-    )  # fmt: skip
-    with files, closing(loader.ahead(len(rows))) as loaded_scans:
-        files.begin(beginning, done, rows, poses, loader)
-        for loaded in loaded_scans:
-            if known and loaded.index == 0:
-                register = partial(odometry.begin_in_map, loaded.scan, priors.first())
-            else:
-                told, pace = priors.motion(loaded.index), scans.pace(loaded.index)
-                register = partial(odometry.register, loaded.scan, told, pace, loaded.moving)
-            frame, seconds = timed(register, scans.where(loaded.index))
-            poses.append(frame.T_first_scan)
-            moving = frame.moving or loaded.moving
-            undone = {"deskewed_by": "azimuth" if beginning.revolution else "times"} if moving else {}
-            rows.append(loaded.row | described(frame, poses) | undone | {"register_s": seconds})
-            if moving:
-                loader.within[loaded.index] = moving.T_begin_end
-            state = {
-                "size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(),
-                "T_begin_end": moving.T_begin_end.tolist() if moving else None, "state": odometry.state(),
-            }  # fmt: skip
-            files.add(rows[-1], poses[-1], moving.still() if moving and merged else loaded.cloud, state)
-            if on_row:
-                on_row(rows[-1], len(rows), len(scans))
+        files = Outputs(
+            scans, options, journal, out=out, residuals=residuals, merged=merged, voxel=beginning.frame.voxel
+        )  # fmt: skip
+        with files:
+            files.begin(beginning, done, rows, poses, loader)
+            for loaded in loader.ahead(len(rows), readers):
+                if known and loaded.index == 0:
+                    register = partial(odometry.begin_in_map, loaded.scan, priors.first())
+                else:
+                    told, pace = priors.motion(loaded.index), scans.pace(loaded.index)
+                    register = partial(odometry.register, loaded.scan, told, pace, loaded.moving)
+                frame, seconds = timed(register, scans.where(loaded.index))
+                poses.append(frame.T_first_scan)
+                moving = frame.moving or loaded.moving
+                undone = {"deskewed_by": "azimuth" if beginning.revolution else "times"} if moving else {}
+                rows.append(loaded.row | described(frame, poses) | undone | {"register_s": seconds})
+                if moving:
+                    loader.within[loaded.index] = moving.T_begin_end
+                state = {
+                    "size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(),
+                    "T_begin_end": moving.T_begin_end.tolist() if moving else None, "state": odometry.state(),
+                }  # fmt: skip
+                files.add(rows[-1], poses[-1], moving.still() if moving and merged else loaded.cloud, state)
+                if on_row:
+                    on_row(rows[-1], len(rows), len(scans))
 
-        path, loops = np.stack(poses), tuple[tuple[int, int], ...]()
-        if options.loop_closure:
-            path, loops = close(path, rows, beginning.frame, loader, options)
-        before = files.written(np.stack(poses)) if options.loop_closure else None
-        result = SequenceResult(
-            files.written(path), rows, beginning.frame.voxel, before, len(loops), out, loops, beginning.revolution
-        )
-        files.finish(result, path, loader)
-    return result
+            path, loops = np.stack(poses), tuple[tuple[int, int], ...]()
+            if options.loop_closure:
+                path, loops = close(path, rows, beginning.frame, loader, options)
+            before = files.written(np.stack(poses)) if options.loop_closure else None
+            result = SequenceResult(
+                files.written(path), rows, beginning.frame.voxel, before, len(loops), out, loops, beginning.revolution
+            )
+            files.finish(result, path, loader)
+        return result
 
 
 def check(scans: Scans, options: SequenceOptions, out: Path | None, resume: bool, known_map: PointCloud | None) -> None:
