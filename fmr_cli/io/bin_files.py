@@ -174,7 +174,8 @@ def find_width(sample: np.ndarray, fitting: list[int]) -> int:
     """How many numbers a point has: as many as tell best what value stands where."""
     if len(fitting) == 1 or (4 in fitting and np.isfinite(sample).sum() < FEW):
         return 4 if 4 in fitting else fitting[0]
-    told = {width: column_information(sample, width) for width in fitting}
+    quantile = quantiles(sample)
+    told = {width: column_information(quantile, width) for width in fitting}
     best = max(told.values())
     near = [width for width in fitting if told[width] >= NEARLY * best]
     rivals = [w for w in near if w % near[0]]
@@ -184,16 +185,21 @@ def find_width(sample: np.ndarray, fitting: list[int]) -> int:
     return near[0]
 
 
-def column_information(sample: np.ndarray, width: int) -> float:
+def quantiles(sample: np.ndarray) -> np.ndarray:
+    """Which of BINS quantiles each number is in, (n,) int from 0; BINS where it is not finite."""
+    finite = np.isfinite(sample)
+    edges = np.unique(np.quantile(sample[finite], np.linspace(0, 1, BINS + 1)[1:-1]))
+    return np.where(finite, np.searchsorted(edges, sample, side="right"), BINS)
+
+
+def column_information(quantile: np.ndarray, width: int) -> float:
     """The mutual information, nats, of a number's value and its place in the point, if a point has ``width``.
 
     Where the width is wrong, every column is a mixture of several and looks like the others. Values are told apart
-    by BINS quantiles, and what a finite sample gives by chance is taken off (Miller and Madow).
+    by ``quantiles`` (n,), and what a finite sample gives by chance is taken off (Miller and Madow).
     """
-    rows = sample[: len(sample) // width * width].reshape(-1, width)
-    edges = np.unique(np.quantile(rows[np.isfinite(rows)], np.linspace(0, 1, BINS + 1)[1:-1]))
-    place = np.where(np.isfinite(rows), np.searchsorted(edges, rows, side="right"), len(edges) + 1)
-    counts = np.stack([np.bincount(column, minlength=len(edges) + 2) for column in place.T]).astype(float)
+    rows = quantile[: len(quantile) // width * width].reshape(-1, width)
+    counts = np.stack([np.bincount(column, minlength=BINS + 1) for column in rows.T]).astype(float)
     share = counts / counts.sum()
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = share * np.log(share / (share.sum(0) * share.sum(1, keepdims=True)))
