@@ -173,7 +173,7 @@ def register(scans: Scans, frame: VoxelFrame, first: int) -> Place | None:
         guess = poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1] if len(poses) > 1 else np.eye(4)
         fits = [local_map.fit(scan, guess, edges, "prediction") for edges in ((WIDE, COARSE, FINE), (COARSE, FINE))]
         fit = min(fits, key=lambda fit: fit.total)
-        T_first_scan, _, _, matches = local_map.planes.fit(scan, fit.T_map_scan, 0.0)
+        T_first_scan, _, _, matches = local_map.surface.planes.fit(scan, fit.T_map_scan, 0.0)
         if matches is None or fit.overlap < LEAST_OVERLAP:
             return None
         poses.append(T_first_scan)

@@ -26,7 +26,7 @@ def without_motion(
     how sure the motion is that it was made ready by.
     """
     for _ in range(ROUNDS):
-        T_map_scan, twist, rms = local_map.planes.fit_moving(scan, fit.T_map_scan, slope, information)
+        T_map_scan, twist, rms = local_map.surface.planes.fit_moving(scan, fit.T_map_scan, slope, information)
         ends = displacement(exp(twist), np.eye(4), scan.points)
         if not ends > LEFT * max(rms, LEAST_SIGMA):
             break

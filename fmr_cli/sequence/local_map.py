@@ -18,7 +18,7 @@ from fmr_cli.sequence.observability import (
     clearly_observed,
     observe,
 )
-from fmr_cli.sequence.plane_map import PlaneMap
+from fmr_cli.sequence.plane_map import PlaneMap, VoxelSums
 from fmr_cli.sequence.prepared_scan import MIN_POINTS, NEIGHBOURS, PreparedScan, with_covariances
 
 # Edges of the map's three levels, voxels: the working one, and two from which larger motions are reached.
@@ -67,63 +67,55 @@ class Fit:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A scan that is part of the map: its place in the sequence, itself, and its pose (4, 4)."""
+    """A scan that is part of the map: its place in the sequence, and its pose (4, 4)."""
 
     index: int
-    scan: PreparedScan
     T_map_scan: np.ndarray
 
 
-class Level:
-    """A Gaussian voxel map of one edge. What is added waits until somebody asks, which for large edges is seldom."""
+class Surface:
+    """What scans have seen, as Gaussian voxel maps of three edges and as planes; a known map below, if there is one."""
 
-    def __init__(self, edge: float) -> None:
-        self._map = small_gicp.GaussianVoxelMap(edge)
-        self._map.set_lru(horizon=NO_LRU)
-        self._waiting: list[tuple[small_gicp.PointCloud, np.ndarray]] = []
+    def __init__(self, known: KnownMap | None = None) -> None:
+        self.levels = {edge: small_gicp.GaussianVoxelMap(edge) for edge in (FINE, COARSE, WIDE)}
+        for level in self.levels.values():
+            level.set_lru(horizon=NO_LRU)
+        self.planes = PlaneMap(two_sided=known is not None)
+        if known:
+            self.add(known.cloud, known.cloud, VoxelSums.of(known.points, known.normals, np.eye(4)), np.eye(4))
 
-    def add(self, cloud: small_gicp.PointCloud, T_map_cloud: np.ndarray) -> None:
-        self._waiting.append((cloud, T_map_cloud))
-
-    def map(self) -> small_gicp.GaussianVoxelMap:
-        for cloud, T_map_cloud in self._waiting:
-            self._map.insert(cloud, T_map_cloud)
-        self._waiting.clear()
-        return self._map
+    def add(
+        self, fine: small_gicp.PointCloud, coarse: small_gicp.PointCloud, seen: VoxelSums, T_map_scan: np.ndarray
+    ) -> None:
+        """Add a scan: its points with covariances, fewer of them for large voxels, and what they come to by voxel."""
+        for edge, level in self.levels.items():
+            level.insert(fine if edge == FINE else coarse, T_map_scan)
+        self.planes.add(seen)
 
 
 class LocalMap:
-    """The last keyframes as Gaussian voxel maps of three edges, and as planes; a known map below them, if there is one.
+    """The last keyframes as one surface; a known map below them, if there is one.
 
     It is a function of these alone: so it can be built again after a kill. Keyframes add to a known map only where it
-    has nothing.
+    has nothing. Those that will be left once the oldest are forgotten make up a second surface meanwhile: so no scan
+    has to be kept.
     """
 
     def __init__(self, known: KnownMap | None = None) -> None:
         self.known = known
         self.keyframes: list[Keyframe] = []
-        self._clear()
-
-    def _clear(self) -> None:
-        self.levels = {edge: Level(edge) for edge in (FINE, COARSE, WIDE)}
-        self.planes = PlaneMap(two_sided=self.known is not None)
-        if self.known:
-            for level in self.levels.values():
-                level.add(self.known.cloud, np.eye(4))
-            self.planes.insert(self.known.points, self.known.normals, np.eye(4))
+        self.surface = Surface(known)
+        self.later: Surface | None = None
 
     def insert(self, index: int, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
         """Add a keyframe; where there are many, the oldest are forgotten."""
-        self.keyframes.append(Keyframe(index, scan, T_map_scan))
-        added = self.keyframes[-1:]
-        if len(self.keyframes) >= 2 * MAP_KEYFRAMES:
-            self._clear()
-            added = self.keyframes = self.keyframes[-MAP_KEYFRAMES:]
-        for keyframe in added:
-            self._add(keyframe)
+        self.keyframes.append(Keyframe(index, T_map_scan))
+        self._add(scan, T_map_scan)
+        if len(self.keyframes) == 2 * MAP_KEYFRAMES:
+            self.keyframes = self.keyframes[-MAP_KEYFRAMES:]
+            self.surface, self.later = self.later or Surface(self.known), None
 
-    def _add(self, keyframe: Keyframe) -> None:
-        scan, T_map_scan = keyframe.scan, keyframe.T_map_scan
+    def _add(self, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
         points, normals = scan.points[scan.solid], scan.normals[scan.solid]
         fine, coarse = scan.cloud, scan.fitted  # large voxels get points enough of the few, too
         if self.known:
@@ -132,9 +124,11 @@ class LocalMap:
                 return
             points, normals = points[new], normals[new]
             fine = coarse = with_covariances(points, NEIGHBOURS)
-        for edge, level in self.levels.items():
-            level.add(fine if edge == FINE else coarse, T_map_scan)
-        self.planes.insert(points, normals, T_map_scan)
+        seen = VoxelSums.of(points, normals, T_map_scan)
+        self.surface.add(fine, coarse, seen, T_map_scan)
+        if len(self.keyframes) > MAP_KEYFRAMES:
+            self.later = self.later or Surface(self.known)
+            self.later.add(fine, coarse, seen, T_map_scan)
 
     def fit(
         self, scan: PreparedScan, T_map_guess: np.ndarray, edges: tuple[float, ...], start: str, few: bool = False
@@ -146,7 +140,7 @@ class LocalMap:
         T_map_scan, cloud = T_map_guess, scan.fitted if few else scan.cloud
         for edge in edges:
             found = small_gicp.align(
-                self.levels[edge].map(), cloud, T_map_scan, max_correspondence_distance=REACH * edge, num_threads=1,
+                self.surface.levels[edge], cloud, T_map_scan, max_correspondence_distance=REACH * edge, num_threads=1,
                 max_iterations=MAX_ITERATIONS, rotation_epsilon=ROTATION_EPSILON * edge,
                 translation_epsilon=TRANSLATION_EPSILON * edge,
             )  # fmt: skip
@@ -159,7 +153,7 @@ class LocalMap:
 
         slope: how residuals grow with range, see ``plane_map.trust``.
         """
-        T_map_scan, rms, slope, matches = self.planes.fit(scan, fit.T_map_scan, slope)
+        T_map_scan, rms, slope, matches = self.surface.planes.fit(scan, fit.T_map_scan, slope)
         seen = self._seen(scan, T_map_scan, matches) if matches else None
         return replace(fit, T_map_scan=orthonormal(T_map_scan), rms=rms, seen=seen), slope
 

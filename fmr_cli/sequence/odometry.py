@@ -240,10 +240,8 @@ class Odometry:
         return bool(of_map.min(initial=np.inf) > MATTERS**-2)
 
     def _remember(self, index: int, scan: PreparedScan, T_map_scan: np.ndarray) -> None:
-        """This is the scan before the next one; nobody will ask for all points of the one before it."""
-        if self.last[1] is not scan:
-            self.last[1].whole = None
-        self.last = (index, scan, T_map_scan)
+        """This is the scan before the next one; nobody will ask again for the one before it."""
+        self.last, self.by_features = (index, scan, T_map_scan), None
 
     def _fits(self, fit: Fit) -> bool:
         usual = float(np.median([overlap for overlap, _ in self.usual])) if self.usual else 0.0
@@ -427,7 +425,5 @@ class Odometry:
         self.usual.extend((overlap, total) for overlap, total in state["usual"])
         self.slopes.extend(state["slopes"])
         for index in state["map"]:
-            keyframe = load(index)
-            keyframe.whole = None
-            self.map.insert(index, keyframe, T_map_scan[index])
+            self.map.insert(index, load(index), T_map_scan[index])
         self.last = (state["last"], load(state["last"]), T_map_scan[state["last"]])

@@ -6,6 +6,8 @@ few wrong ones, or a depth camera's distorted far points, move the result by mor
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import small_gicp
 
@@ -34,6 +36,22 @@ SHARED = 10.0
 BANDS = 8  # of equal count by range from the sensor
 
 
+@dataclass(frozen=True)
+class VoxelSums:
+    """Of the voxels that a scan has points in: keys (M,), sorted, and sums (M, 7): count, points, normals; map axes."""
+
+    keys: np.ndarray
+    sums: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, normals: np.ndarray, T: np.ndarray) -> VoxelSums:
+        """Of points and their unit normals (N, 3), moved by T (4, 4)."""
+        moved = transform_points(T, points)
+        keys, inverse = np.unique(voxel_keys(moved, 1.0), return_inverse=True)
+        values = np.concatenate([np.ones((len(points), 1)), moved, normals @ T[:3, :3].T], 1)
+        return cls(keys, np.stack([np.bincount(inverse, column, len(keys)) for column in values.T], 1))
+
+
 class PlaneMap:
     """Sums of points and normals by voxel; a point looks for the nearest mean.
 
@@ -43,21 +61,17 @@ class PlaneMap:
     def __init__(self, two_sided: bool = False) -> None:
         self.two_sided = two_sided
         self.keys = np.zeros(0, np.int64)  # of the voxels, sorted
-        self.sums = np.zeros((0, 7))  # count, points, normals
+        self.sums = np.zeros((0, 7))  # see ``VoxelSums``
         self.tree: small_gicp.KdTree | None = None
 
-    def insert(self, points: np.ndarray, normals: np.ndarray, T: np.ndarray) -> None:
-        """Add a scan's points and unit normals (N, 3), moved by T."""
-        moved = transform_points(T, points)
-        keys, inverse = np.unique(voxel_keys(moved, 1.0), return_inverse=True)
-        values = np.concatenate([np.ones((len(points), 1)), moved, normals @ T[:3, :3].T], 1)
-        sums = np.stack([np.bincount(inverse, column, len(keys)) for column in values.T], 1)
-        place = np.searchsorted(self.keys, keys)
+    def add(self, seen: VoxelSums) -> None:
+        """Add what a scan has seen."""
+        place = np.searchsorted(self.keys, seen.keys)
         known = place < len(self.keys)
-        known[known] = self.keys[place[known]] == keys[known]
-        self.sums[place[known]] += sums[known]
-        self.keys = np.insert(self.keys, place[~known], keys[~known])
-        self.sums = np.insert(self.sums, place[~known], sums[~known], 0)
+        known[known] = self.keys[place[known]] == seen.keys[known]
+        self.sums[place[known]] += seen.sums[known]
+        self.keys = np.insert(self.keys, place[~known], seen.keys[~known])
+        self.sums = np.insert(self.sums, place[~known], seen.sums[~known], 0)
         self.tree = None
 
     def _settle(self) -> None:

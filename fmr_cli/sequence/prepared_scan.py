@@ -55,15 +55,14 @@ class PreparedScan:
     """A scan in voxels: thinned ``points`` (N, 3), unit ``normals`` towards the sensor, ``ranges`` (N,) from it.
 
     ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``whole``: (M, 3) float32,
-    the points before thinning; None once nobody will ask for them, since a map of whole scans would take too much
-    memory. It can be pickled until one of its clouds was asked for. ``when``: (N,), when the points were measured, 0 to
-    1 over the scan, or None.
+    the points before thinning. It can be pickled until one of its clouds was asked for. ``when``: (N,), when the points
+    were measured, 0 to 1 over the scan, or None.
     """
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray, times: np.ndarray | None = None) -> None:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels. times: (M,), 0 to 1 over the scan."""
-        self.whole: np.ndarray | None = points.astype(np.float32)
-        # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the map keeps the scan.
+        self.whole = points.astype(np.float32)
+        # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the scan is kept.
         self.points = np.array(small_gicp.voxelgrid_sampling(points, 1.0).points()[:, :3], order="C")
         self.when = None if times is None else mean_by_voxel(points, times, self.points)
         tree = small_gicp.KdTree(self.points)
@@ -144,10 +143,10 @@ class PreparedScan:
         return prepare(PointCloud(self.points))
 
     def whole_for_align(self) -> Prepared:
-        """The same with all of its points; of the thinned ones where these are gone."""
+        """The same with all of its points."""
         from fmr_cli.registration.pipeline import prepare
 
-        return self.for_align if self.whole is None else prepare(PointCloud(self.whole.astype(float)))
+        return prepare(PointCloud(self.whole.astype(float)))
 
 
 def mean_by_voxel(points: np.ndarray, values: np.ndarray, thinned: np.ndarray) -> np.ndarray:

@@ -153,12 +153,6 @@ def test_what_two_scans_across_a_gap_leave_open_the_map_has_to_determine(at_a_ga
     assert odometry._borne_out(scan, T_map_scan, fit) == observed
 
 
-def test_all_points_are_kept_of_the_last_scan_alone(at_a_gap):
-    odometry = at_a_gap[0]
-    assert odometry.last[1].whole is not None
-    assert all(k.scan.whole is None for k in odometry.map.keyframes if k.scan is not odometry.last[1])
-
-
 def test_the_unit_and_the_place_do_not_matter(turning, first_four):
     scans, truth = turning[0][:4], turning[1][:4]
     far = np.array([600_000.0, 5_000_000.0, 100.0])
