@@ -23,11 +23,10 @@ WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be r
 AGAIN = 4  # poses of a look, the best ones, that the next one judges on its own voxels
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
 # A look: the voxel edge, times the one that suits, and keypoints. The first one is often sure already; the second one
-# has its voxels and what is described on them, and is most often sure of what the first one is not.
-FIRST, CLOSER = (1.5, 250), (1.5, 1000)
-# The looks after them; the coarsest for LiDAR scans far apart in a street, whose rings lie far apart.
-FURTHER = ((1.0, 1000), (0.7, 1000), (2.8, 1000))
-COARSE = 2.0  # from which a look's poses are too rough to be refined on the voxels that they are judged on
+# has its voxels and what is described on them, and is most often sure of what the first one is not. The third one sees
+# what LiDAR scans share far from both sensors, where points lie so far apart that finer voxels hold no surface.
+FIRST, CLOSER, WIDER = (1.5, 250), (1.5, 1000), (2.8, 1000)
+FINE = ((1.0, 1000), (0.7, 1000))  # the last look: hypotheses from both, judged on the voxels of the first one
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 
 log = logging.getLogger(__name__)
@@ -41,15 +40,31 @@ def at_once(
     time: Stopwatch,
     first: Judge | None = None,
 ) -> Judge:
-    """Looks at all of the target, dearer ones while none is sure. first: what a first look has found already."""
-    judge = first
-    if isinstance(options.init, str) and options.init == "auto" and options.voxel_size is None:
-        for detail in (CLOSER,) if first else (FIRST, CLOSER):
+    """Looks at all of the target, dearer ones while none is sure. first: what FIRST has found already.
+
+    A look goes on from the poses of the surest one before it. Where none is sure, the last one, on the finest voxels, has
+    the last word on the pose that it finds; where that is another one, the surer look is believed.
+    """
+    judges = [first] if first else []
+    if isinstance(options.init, str) and options.init == "auto":
+        looks = (FIRST, CLOSER, WIDER) if options.voxel_size is None else (WIDER,)
+        for detail in looks[len(judges) :]:
             with suppress(RegistrationError):  # too few voxels of that size
-                judge = coarse_look(make_pair(source, target, options, threads, *detail), time, judge)
-                if judge.sure(SURE):
-                    return judge
-    return further(source, target, options, threads, time, former=judge)
+                pair = make_pair(source, target, options, threads, *detail)
+                judges.append(coarse_look(pair, time, surest(judges)))
+                if judges[-1].sure(SURE):
+                    return judges[-1]
+    former = surest(judges)
+    last = further(source, target, options, threads, time, former=former)
+    if former and former.sure(last.best.confidence):
+        if not former.pair.same(former.best.T_target_source, last.best.T_target_source):
+            return former
+    return last
+
+
+def surest(judges: list[Judge]) -> Judge | None:
+    """The look that is surest of its best pose, None if none has one."""
+    return max((j for j in judges if j.candidates), key=lambda j: j.best.confidence, default=None)
 
 
 def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None, known: float = 0.0) -> Judge:
@@ -82,26 +97,20 @@ def further(
     enough: float = SURE,
     former: Judge | None = None,
 ) -> Judge:
-    """What fine voxels, more places and other scales find, until a pose has ``enough`` confidence.
+    """What fine voxels find, until a pose has ``enough`` confidence.
 
     former: what a look on coarse voxels has found.
     """
-    judge = Judge(make_pair(source, target, options, threads, *FURTHER[0]))
+    judge = Judge(make_pair(source, target, options, threads, *FINE[0]))
     pair = judge.pair
     if not isinstance(options.init, str) or options.init in ("identity", "centroid"):
         return from_given(judge, options.init, time)
     look_again(judge, former, time)
     if options.init != "search":
-        for coarseness, keypoints in FURTHER:
+        for detail in FINE:
             with suppress(RegistrationError):
-                seen = pair if coarseness == 1.0 else make_pair(source, target, options, threads, coarseness, keypoints)
-                found = features(seen, time)
-                if coarseness >= COARSE:
-                    with time.stage("refine"):
-                        rough = refinement.roughly(seen, found)
-                        fine = refinement.refined(seen, rough)
-                        found = [replace(h, T_target_source=T) for h, T in zip(rough, fine, strict=True)]
-                consider(judge, found, time)
+                seen = pair if detail == FINE[0] else make_pair(source, target, options, threads, *detail)
+                consider(judge, features(seen, time), time)
             if judge.sure(enough):
                 return judge
     if options.init == "search" or (options.init == "auto" and not likely(judge) and may_overlap_fully(pair)):

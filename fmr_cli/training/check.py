@@ -24,7 +24,7 @@ from fmr_cli.io.weights import weights_bytes
 from fmr_cli.multiway.store import Store
 from fmr_cli.registration import Options, align, prepare
 from fmr_cli.registration.confidence import ALIGNED, SURE_LOGIT
-from fmr_cli.registration.looks import FURTHER
+from fmr_cli.registration.looks import FINE
 from fmr_cli.registration.models import model
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.prepared import Prepared
@@ -150,7 +150,7 @@ def outcome(ends: tuple[Prepared, Prepared], truth: np.ndarray, options: Options
     off = np.linalg.norm(transform_points(found.T_target_source, points) - transform_points(truth, points), axis=1)
     degrees = angle_degrees(np.linalg.inv(truth) @ found.T_target_source)
     size = float(np.ptp(target.points, axis=0).max())
-    pair = make_pair(source, target, options, 1, *FURTHER[0])
+    pair = make_pair(source, target, options, 1, *FINE[0])
     matches = pair.inlier_count(pair.enter_centred(truth)) / max(len(pair.matches[0]), 1)
     p = min(max(found.confidence, 1e-9), 1 - 1e-9)
     right = degrees <= RIGHT_DEGREES and off.mean() < RIGHT_SHARE * size
