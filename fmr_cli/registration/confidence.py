@@ -38,6 +38,8 @@ LACKING_MUCH, IF_LACKING = 1.0, 0.3
 SCANT, IF_SCANT = 0.1, 0.5
 # Fewer points of detail than that, hardly more than a corner, which fits any other: 14 of 234 were right.
 BARE, IF_BARE = 5, 0.3
+# Less support than that, by itself hardly likely: 8 of 12 that were believed for want of rivals were right.
+UNLIKELY, IF_UNLIKELY = 0.3, 0.5
 # A rival that has ABOUT as much support and weighs NEARLY as much, where no thing stands out that one scan lacks (the
 # largest has less than STANDS_OUT times as many points as the pose's own): one of the like may stand first for being
 # seen from the same side in both scans, as bays of a rack. Wrong is SO_MANY times as likely then, by hand: on 1,400
@@ -135,7 +137,7 @@ def confidences(x: np.ndarray, largest: np.ndarray, weights: Weights) -> tuple[n
     best = int(weigh.argmax())
     logit = products(first[None], weights) @ weights.verdict
     p = float(sigmoid(logit - np.log(SO_MANY) * rivalled(x, largest, weigh, weights))[0])
-    p = min(p, most(x[best]))
+    p = min(p, most(x[best], weights))
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
     shares[best] = p
@@ -151,9 +153,10 @@ def among(confidence: float, others: Sequence[float]) -> float:
     return odds / (1 + odds + sum(more))
 
 
-def most(x: np.ndarray) -> float:
-    """The confidence that evidence x (d,) allows at most, whatever the weights say."""
+def most(x: np.ndarray, weights: Weights) -> float:
+    """The confidence that evidence x (d,) allows at most, whatever the weights of the verdict say."""
     bounds = [
+        (support(x, weights) < UNLIKELY, IF_UNLIKELY),
         (-x[STRETCH] > 100 * OTHER_SCALE, IN_OTHER_SCALE),
         (x[CONTRADICTION] < 0, DENIED),
         (x[MISSING] < LACKING_MUCH, IF_LACKING),

@@ -42,8 +42,8 @@ def at_once(
 ) -> Judge:
     """Looks at all of the target, dearer ones while none is sure. first: what FIRST has found already.
 
-    A look goes on from the poses of the surest one before it. Where none is sure, the last one, on the finest voxels, has
-    the last word on the pose that it finds; where that is another one, the surer look is believed.
+    A look goes on from the poses of the surest one before it. Where none is sure, the last one, on the finest voxels,
+    has the last word on the pose that it finds; where that is another one, the surer look is believed.
     """
     judges = [first] if first else []
     if isinstance(options.init, str) and options.init == "auto":
@@ -53,13 +53,20 @@ def at_once(
                 pair = make_pair(source, target, options, threads, *detail)
                 judges.append(coarse_look(pair, time, surest(judges)))
                 if judges[-1].sure(SURE):
-                    return judges[-1]
+                    return finer(judges[-1])
     former = surest(judges)
     last = further(source, target, options, threads, time, former=former)
-    if former and former.sure(last.best.confidence):
-        if not former.pair.same(former.best.T_target_source, last.best.T_target_source):
-            return former
-    return last
+    if former is None or not former.sure(last.best.confidence):
+        return last
+    same = former.pair.same(former.best.T_target_source, last.best.T_target_source)
+    return last if same else finer(former)
+
+
+def finer(judge: Judge) -> Judge:
+    """A look with its pair on CLOSER's voxels, if its own are larger: too large to refine and describe its pose."""
+    wide = judge.pair
+    pair = make_pair(wide.source, wide.target, wide.options, wide.threads, *CLOSER)
+    return judge if wide.edge <= pair.edge else replace(judge, pair=pair)
 
 
 def surest(judges: list[Judge]) -> Judge | None:
