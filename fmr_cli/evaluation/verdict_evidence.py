@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration.confidence import Judge
-from fmr_cli.registration.looks import CLOSER, FIRST, WIDER, coarse_look, further, surest
+from fmr_cli.registration.looks import CLOSER, FIRST, coarse_look, further
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.pipeline import one_blas_thread
@@ -45,7 +44,7 @@ class Judged:
 
 
 def gather(pairs: int, seed: int, workers: int | None = None) -> list[Judged]:
-    """The evidence of ``pairs`` fresh pairs, four looks each, the same whatever the number of workers."""
+    """The evidence of ``pairs`` fresh pairs, three looks each, the same whatever the number of workers."""
     with ProcessPoolExecutor(workers or usable_cores(), mp_context=multiprocessing.get_context("spawn")) as pool:
         found = pool.map(pair_evidence, [(seed, number) for number in range(pairs)], chunksize=CHUNK)
         return [judged for looks in found for judged in looks]
@@ -79,8 +78,6 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
 def all_looks(source: Prepared, target: Prepared) -> list[Judge]:
     """What ``align`` would judge at each look, had the one before not been enough; those on other voxels are one."""
     time = Stopwatch()
-    judges: list[Judge] = []
-    for detail in FIRST, CLOSER, WIDER:
-        with suppress(RegistrationError):
-            judges.append(coarse_look(make_pair(source, target, Options(), 1, *detail), time, surest(judges)))
-    return [*judges, further(source, target, Options(), 1, time, enough=2.0, former=surest(judges))]
+    first = coarse_look(make_pair(source, target, Options(), 1, *FIRST), time)
+    closer = coarse_look(make_pair(source, target, Options(), 1, *CLOSER), time, first)
+    return [first, closer, further(source, target, Options(), 1, time, enough=2.0, former=closer)]
