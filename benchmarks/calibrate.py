@@ -32,11 +32,9 @@ from fmr_cli.registration.confidence import (
     SCANT,
     SHARE,
     STRETCH,
-    UNLIKELY,
     detail_log,
     rivalled,
     standing,
-    support,
 )
 from fmr_cli.registration.verdict_weights import Weights
 from fmr_cli.report.calibration import calibration_table, plot_calibration
@@ -59,7 +57,6 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
         ("a third missing", seen[:, MISSING] < LACKING_MUCH),
         ("hardly anything explained", seen[:, SHARE] < np.log(SCANT)),
         ("hardly more than three planes", seen[:, DETAIL] < detail_log(BARE)),
-        ("hardly likely by itself", support(seen, weights) < UNLIKELY),
         ("nothing stands out at a close rival", alike),
     ):
         said.append(f"{name}: {good[holds].sum()} of {holds.sum()} poses that stood first were right")

@@ -29,17 +29,15 @@ MOST_STRETCH = 0.05  # a stretch beyond it is as bad
 AS_GOOD = 1.5  # times as close as a surface's own neighbours: beyond, points are the same, and no surer for it
 # What no other evidence outweighs, and the confidence that it leaves at most; by the looks at 1,400 made-up pairs, bent
 # ones too (`python -m benchmarks.calibrate` counts them). Such pairs are too few for the weights to say so themselves.
-OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: 5 of 4159 right poses had that
-DENIED = 0.1  # more contradicted than explained: 1 of 90 poses that stood first was right
-# More than a third as many points missing as explained (1 : e): 18 of 348 were right. Furniture that was moved,
+OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: 2 of 3243 right poses had that
+DENIED = 0.1  # more contradicted than explained: none of 75 poses that stood first was right
+# More than a third as many points missing as explained (1 : e): 21 of 297 were right. Furniture that was moved,
 # another scale, another place of the like.
 LACKING_MUCH, IF_LACKING = 1.0, 0.3
-# Less than a tenth of the smaller scan explained: 16 of 40 were right, and streets turned end to end fit so.
+# Less than a tenth of the smaller scan explained: 8 of 26 were right, and streets turned end to end fit so.
 SCANT, IF_SCANT = 0.1, 0.5
-# Fewer points of detail than that, hardly more than a corner, which fits any other: 38 of 355 were right.
+# Fewer points of detail than that, hardly more than a corner, which fits any other: 14 of 234 were right.
 BARE, IF_BARE = 5, 0.3
-# Less support than that: 49 of 680 were right, and 8 of 12 that were believed for want of rivals.
-UNLIKELY, IF_UNLIKELY = 0.3, 0.5
 # A rival that has ABOUT as much support and weighs NEARLY as much, where no thing stands out that one scan lacks (the
 # largest has less than STANDS_OUT times as many points as the pose's own): one of the like may stand first for being
 # seen from the same side in both scans, as bays of a rack. Wrong is SO_MANY times as likely then, by hand: on 1,400
@@ -137,7 +135,7 @@ def confidences(x: np.ndarray, largest: np.ndarray, weights: Weights) -> tuple[n
     best = int(weigh.argmax())
     logit = products(first[None], weights) @ weights.verdict
     p = float(sigmoid(logit - np.log(SO_MANY) * rivalled(x, largest, weigh, weights))[0])
-    p = min(p, most(x[best], weights))
+    p = min(p, most(x[best]))
     rest = np.delete(weigh, best).sum()
     shares = np.minimum((1 - p) * weigh / max(rest, 1e-300), p * weigh / max(weigh[best], 1e-300))
     shares[best] = p
@@ -153,10 +151,9 @@ def among(confidence: float, others: Sequence[float]) -> float:
     return odds / (1 + odds + sum(more))
 
 
-def most(x: np.ndarray, weights: Weights) -> float:
-    """The confidence that evidence x (d,) allows at most, whatever the weights of the verdict say."""
+def most(x: np.ndarray) -> float:
+    """The confidence that evidence x (d,) allows at most, whatever the weights say."""
     bounds = [
-        (support(x, weights) < UNLIKELY, IF_UNLIKELY),
         (-x[STRETCH] > 100 * OTHER_SCALE, IN_OTHER_SCALE),
         (x[CONTRADICTION] < 0, DENIED),
         (x[MISSING] < LACKING_MUCH, IF_LACKING),
