@@ -22,9 +22,9 @@ REFINED = 8  # hypotheses that are refined, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined, and a rough pose to be judged
 AGAIN = 4  # poses of a look, the best ones, that the next one judges on its own voxels
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
-# Wide voxels don't tell bays of a rack or rows of seats from each other: on 1,400 made-up pairs 18 of 746 aligned poses
-# were wrong with these two (16 of 709 without the wide look), 24 of 764 with SURE and with whatever is surer.
-SURE_WIDE, BELIEVED = 0.97, 0.9
+# The same of wide voxels, which don't tell bays of a rack or rows of seats from each other: on 1,400 made-up pairs 18 of
+# 739 aligned poses were wrong so (16 of 709 without the wide look), 24 of 764 with SURE and with whatever is surer.
+SURE_WIDE = 0.97
 # A look: the voxel edge, times the one that suits, and keypoints. The first one is often sure already; the second one
 # has its voxels and what is described on them, and is most often sure of what the first one is not. The third one sees
 # what LiDAR scans share far from both sensors, where points lie so far apart that finer voxels hold no surface.
@@ -45,9 +45,9 @@ def at_once(
 ) -> Judge:
     """Looks at all of the target, dearer ones while none is sure. first: what FIRST has found already.
 
-    Where none is sure, the last one has the last word, unless it finds another pose than WIDER and is less sure of it.
+    Where none is sure, the last one has the last word.
     """
-    judges, wide = [first] if first else [], None
+    judges = [first] if first else []
     auto = isinstance(options.init, str) and options.init == "auto"
     for detail in (FIRST, CLOSER)[len(judges) :] if auto and options.voxel_size is None else ():
         with suppress(RegistrationError):  # too few voxels of that size
@@ -60,11 +60,7 @@ def at_once(
             if wide.sure(SURE_WIDE):
                 return finer(wide)
             judges.append(wide)
-    last = further(source, target, options, threads, time, former=surest(judges))
-    if wide is None or not wide.sure(max(BELIEVED, last.best.confidence)):
-        return last
-    same = wide.pair.same(wide.best.T_target_source, last.best.T_target_source)
-    return last if same else finer(wide)
+    return further(source, target, options, threads, time, former=surest(judges))
 
 
 def surest(judges: list[Judge]) -> Judge | None:
