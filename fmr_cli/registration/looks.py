@@ -22,8 +22,8 @@ REFINED = 8  # hypotheses that are refined, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined, and a rough pose to be judged
 AGAIN = 4  # poses of a look, the best ones, that the next one judges on its own voxels
 SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
-# The same of wide voxels, which don't tell bays of a rack or rows of seats from each other: on 1,400 made-up pairs 18 of
-# 739 aligned poses were wrong so (16 of 709 without the wide look), 24 of 764 with SURE and with whatever is surer.
+# The same on wide voxels, which don't tell bays of a rack or rows of seats from each other: on 1,400 made-up pairs 18
+# of 739 aligned poses were wrong so (16 of 709 without the wide look), 24 of 764 with SURE and with whatever is surer.
 SURE_WIDE = 0.97
 # A look: the voxel edge, times the one that suits, and keypoints. The first one is often sure already; the second one
 # has its voxels and what is described on them, and is most often sure of what the first one is not. The third one sees
