@@ -16,7 +16,7 @@ from fmr_cli.errors import FmrError, RegistrationError
 from fmr_cli.registration import looks
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import prepare
-from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.prepared import Prepared, pair_edge
 from fmr_cli.registration.result import Registration
 from fmr_cli.synthetic import scenes
 from fmr_cli.synthetic.verdict_pairs import fresh_pair
@@ -393,9 +393,13 @@ def test_the_metrics_are_plain_json(found: Registration) -> None:
 
 
 @pytest.mark.slow
-def test_scans_far_apart_in_a_street_are_found_on_coarse_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scans_far_apart_in_a_street_are_found_on_wide_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = fresh_pair("street, 30 to 60 %", 9001, 15)
-    source, target = PointCloud(pair.source), PointCloud(pair.target)
-    assert pair.is_right(align(source, target, hints=False).T_target_source)
+    source, target = prepare(PointCloud(pair.source)), prepare(PointCloud(pair.target))
+    found = align(source, target, hints=False)
+    assert pair.is_right(found.T_target_source)
+    assert found.status == "aligned"
+    # Refined and described on voxels that are fine enough for it.
+    assert found.voxel_size == looks.CLOSER[0] * pair_edge(source, target)
     monkeypatch.setattr(looks, "WIDER", looks.CLOSER)
     assert not pair.is_right(align(source, target, hints=False).T_target_source)
