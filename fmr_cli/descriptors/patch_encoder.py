@@ -94,7 +94,7 @@ class LocalEncoder:
     def pooled(self, patches: np.ndarray, room: list[np.ndarray]) -> np.ndarray:
         """The maximum over the points of the MLP; the last bias and ReLU come after it, which is the same."""
         x = patches.reshape(-1, patches.shape[-1])
-        for (weight, bias), out in zip(self.point[:-1], room, strict=False):
+        for (weight, bias), out in zip(self.point[:-1], room[:-1], strict=True):
             x = np.matmul(x, weight.T, out=out[: len(x)])
             x += bias
             np.maximum(x, 0, out=x)

@@ -47,19 +47,16 @@ def at_once(
 
     Where none is sure, the last one has the last word.
     """
-    judges = [first] if first else []
-    auto = isinstance(options.init, str) and options.init == "auto"
-    for detail in (FIRST, CLOSER)[len(judges) :] if auto and options.voxel_size is None else ():
+    judges, looks = [first] if first else [], []
+    if isinstance(options.init, str) and options.init == "auto":
+        looks = [(WIDER, SURE_WIDE)]
+        if options.voxel_size is None:
+            looks = [(FIRST, SURE), (CLOSER, SURE), *looks][len(judges) :]
+    for detail, enough in looks:
         with suppress(RegistrationError):  # too few voxels of that size
             judges.append(coarse_look(make_pair(source, target, options, threads, *detail), time, surest(judges)))
-            if judges[-1].sure(SURE):
-                return judges[-1]
-    if auto:
-        with suppress(RegistrationError):
-            wide = coarse_look(make_pair(source, target, options, threads, *WIDER), time, surest(judges))
-            if wide.sure(SURE_WIDE):
-                return finer(wide)
-            judges.append(wide)
+            if judges[-1].sure(enough):
+                return finer(judges[-1]) if detail == WIDER else judges[-1]
     return further(source, target, options, threads, time, former=surest(judges))
 
 
