@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from fmr_cli.evaluation.verdict import calibration_error
-from fmr_cli.evaluation.verdict_evidence import Judged, gather
+from fmr_cli.evaluation.verdict_evidence import Judged, decisive, gather
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit
 from fmr_cli.registration.confidence import (
     ALIGNED,
@@ -36,6 +36,7 @@ from fmr_cli.registration.confidence import (
     rivalled,
     standing,
 )
+from fmr_cli.registration.looks import COARSE, FINE, Look
 from fmr_cli.registration.verdict_weights import Weights
 from fmr_cli.report.calibration import calibration_table, plot_calibration
 
@@ -63,13 +64,24 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     return said
 
 
-def full_looks(evidence: Sequence[Judged], confidence: np.ndarray, right: np.ndarray) -> str:
-    """How many of the poses that `align` would call aligned are wrong, where it looks as closely as it can."""
-    full = list({j.number: i for i, j in enumerate(evidence)}.values())  # the last look at each pair
-    aligned = [i for i in full if confidence[i] >= ALIGNED]
-    kinds = Counter(evidence[i].kind for i in aligned if not right[i])
+def decisions(evidence: Sequence[Judged], confidence: np.ndarray, right: np.ndarray) -> list[str]:
+    """What ``align`` would say of the pairs, ending at one look each."""
+    looks: dict[int, dict[Look, int]] = {}
+    for i, j in enumerate(evidence):
+        looks.setdefault(j.number, {})[j.look] = i
+    ends = [(at, *decisive({look: float(confidence[i]) for look, i in at.items()})) for at in looks.values()]
+    where, said = np.array([at[look] for at, look, _ in ends]), np.array([p for *_, p in ends])
+    aligned, good = said >= ALIGNED, right[where]
+    unique = np.array([evidence[i].unique for i in where])
+    kinds = Counter(evidence[i].kind for i in where[aligned & ~good])
     named = "; ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-    return f"full looks alone: {kinds.total()} of {len(aligned)} aligned poses are wrong ({named or 'none'})"
+    ended = Counter(look for _, look, _ in ends)
+    return [
+        f"as align decides: {kinds.total()} of {aligned.sum()} aligned poses are wrong ({named or 'none'}), "
+        f"{(aligned & good & unique).sum()} of {(good & unique).sum()} unique right ones are aligned, "
+        f"expected calibration error {calibration_error(said, good):.3f}",
+        "pairs by the look they end at: " + ", ".join(f"{look}: {ended[look]}" for look in (*COARSE, FINE)),
+    ]
 
 
 def main() -> None:
@@ -87,7 +99,7 @@ def main() -> None:
     print(f"{len(evidence)} looks at {args.pairs} pairs, each judged by weights fitted on others:")
     print(calibration_table(confidence, right))
     print(f"expected calibration error {calibration_error(confidence, right):.3f}")
-    print(full_looks(evidence, confidence, right))
+    print(*decisions(evidence, confidence, right), sep="\n")
     weights = fit(evidence)
     for line in bounds_in(evidence, weights):
         print(line)

@@ -10,7 +10,8 @@ depth camera (6 mm, sparse), made once per --out, each in a frame of its own; or
 NAME.pose.txt (4x4, scan to world) beside each, or poses.txt. Trained on every other one, or on the first half, without
 poses; tested on pairs among the others, drawn once, whose smaller share of overlap is 10 to 30, 30 to 60 % and more.
 Said of each band, before and after: pairs right (5 deg, and 2 % of the larger scan's size) with 95 % bounds (Wilson),
-`aligned`, wrong and yet `aligned`, right by the first consensus pose, the share of right matches, seconds.
+`aligned`, wrong and yet `aligned`, right by the first consensus pose, the share of right matches, seconds. --out gets
+the table, report.json, and its picture, gain.png.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from functools import cache, partial
 from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,6 +41,7 @@ from fmr_cli.registration import hypotheses, prepare
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.pipeline import one_blas_thread
 from fmr_cli.registration.prepared import Prepared
+from fmr_cli.report import plots
 from fmr_cli.synthetic.contradicting import lump
 from fmr_cli.synthetic.scenes import Scene, scan, street
 from fmr_cli.synthetic.sensors import overlap
@@ -231,6 +234,25 @@ def summary(rows: list[dict]) -> dict[str, object]:
     return said
 
 
+def picture(path: Path, report: dict[str, dict[str, dict[str, Any]]], title: str) -> None:
+    """The share that is right by each model, band by band, with its bounds; an image file by the path's suffix."""
+    with plots.figure(path, plots.COLUMN, 0.8 * plots.COLUMN) as figure:
+        axes = figure.subplots()
+        pairs = {band: row["pairs"] for bands in report.values() for band, row in bands.items()}
+        named = [f"{band}\n{pairs.get(band, 0)} pairs" for band in BANDS]
+        for i, (name, bands) in enumerate(report.items()):
+            places = [list(BANDS).index(band) + 0.2 * (i - (len(report) - 1) / 2) for band in bands]
+            axes.vlines(places, *zip(*(row["bounds"] for row in bands.values()), strict=True), color=plots.COLORS[i])
+            shares = [row["right"] / row["pairs"] for row in bands.values()]
+            axes.plot(places, shares, "o", color=plots.COLORS[i], label=name)
+            for place, row in zip(places, bands.values(), strict=True):
+                axes.annotate(str(row["right"]), (place, row["bounds"][0]), (0, -9), textcoords="offset points",
+                              ha="center", color=plots.COLORS[i])  # fmt: skip
+        axes.set(title=title, xlabel="overlap", ylabel="share of pairs that is right", ylim=(0, 1.08),
+                 xticks=range(len(BANDS)), xticklabels=named, xlim=(-0.4, len(BANDS) - 0.3))  # fmt: skip
+        axes.legend(loc="lower right", frameon=False)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", help=f"{', '.join(KINDS)}, or a folder of scans with their poses")
@@ -255,6 +277,8 @@ def main() -> None:
         models[f"{minutes:g} min"] = run / "model.safetensors"
     report = test(chosen(cases, given.pairs, given.seed), models, given.starts)
     (given.out / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+    if not given.starts:
+        picture(given.out / "gain.png", report, f"{Path(given.kind).name}, scans that were not trained on")
 
 
 if __name__ == "__main__":

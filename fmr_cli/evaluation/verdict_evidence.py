@@ -6,7 +6,9 @@ Every pose that ``align`` would judge counts, so that the wrong ones are the pla
 from __future__ import annotations
 
 import multiprocessing
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +16,8 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration.confidence import Judge
-from fmr_cli.registration.looks import CLOSER, FIRST, coarse_look, further
+from fmr_cli.registration.confidence import ALIGNED, Judge
+from fmr_cli.registration.looks import COARSE, DISPUTED, FINE, Look, coarse_look, further, surest
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.pipeline import one_blas_thread
@@ -32,19 +34,21 @@ CHUNK = 2  # pairs handed to a worker at a time: a pair takes a second, a hand-o
 class Judged:
     """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool.
 
-    largest: (n,), ``Agreement.largest`` of each; kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
+    largest: (n,), ``Agreement.largest`` of each; look: which one, see ``looks``; kind, unique: of the pair, see
+    ``verdict_pairs``; number: which pair.
     """
 
     x: np.ndarray
     right: np.ndarray
     largest: np.ndarray
+    look: Look
     kind: str
     unique: bool
     number: int
 
 
 def gather(pairs: int, seed: int, workers: int | None = None) -> list[Judged]:
-    """The evidence of ``pairs`` fresh pairs, three looks each, the same whatever the number of workers."""
+    """The evidence of ``pairs`` fresh pairs, four looks each, the same whatever the number of workers."""
     with ProcessPoolExecutor(workers or usable_cores(), mp_context=multiprocessing.get_context("spawn")) as pool:
         found = pool.map(pair_evidence, [(seed, number) for number in range(pairs)], chunksize=CHUNK)
         return [judged for looks in found for judged in looks]
@@ -63,21 +67,35 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
     try:
         with one_blas_thread():
             source, target = Prepared(PointCloud(pair.source)), Prepared(PointCloud(pair.target))
-            for judge in all_looks(source, target):
+            for look, judge in all_looks(source, target).items():
                 poses = [judge.pair.leave_centred(c.T_target_source) for c in judge.candidates]
                 right = [bool(truth) and pair.of(truth).is_right(T, RIGHT_DEGREES, RIGHT_SHARE) for T in poses]
                 x = np.array([c.evidence.vector() for c in judge.candidates])
                 if len(x):
                     largest = np.array([c.evidence.largest for c in judge.candidates])
-                    found.append(Judged(x, np.array(right), largest, pair.kind, pair.unique, seed[1]))
+                    found.append(Judged(x, np.array(right), largest, look, pair.kind, pair.unique, seed[1]))
     except RegistrationError:  # a street and a teacup: nothing to judge
         return []
     return found
 
 
-def all_looks(source: Prepared, target: Prepared) -> list[Judge]:
-    """What ``align`` would judge at each look, had the one before not been enough; those on other voxels are one."""
-    time = Stopwatch()
-    first = coarse_look(make_pair(source, target, Options(), 1, *FIRST), time)
-    closer = coarse_look(make_pair(source, target, Options(), 1, *CLOSER), time, first)
-    return [first, closer, further(source, target, Options(), 1, time, enough=2.0, former=closer)]
+def all_looks(source: Prepared, target: Prepared) -> dict[Look, Judge]:
+    """What ``align`` would judge at each look, had none of those before been enough."""
+    time, judges = Stopwatch(), dict[Look, Judge]()
+    for look in COARSE:
+        with suppress(RegistrationError):  # too few voxels of that size
+            pair, former = make_pair(source, target, Options(), 1, *look), surest(list(judges.values()))
+            judges[look] = coarse_look(pair, time, former)
+    return judges | {FINE: further(source, target, Options(), 1, time, surest(list(judges.values())))}
+
+
+def decisive(said: Mapping[Look, float]) -> tuple[Look, float]:
+    """Where ``align`` ends (``looks.at_once``): at which look, with which confidence; said: that of each look."""
+    coarse = [look for look in COARSE if look in said]
+    for look in coarse:
+        if said[look] >= COARSE[look]:
+            return look, said[look]
+    best = max(coarse, key=lambda look: said[look], default=FINE)
+    if FINE in said and said[FINE] >= min(ALIGNED, said[best]):
+        return FINE, said[FINE]
+    return best, min(said[best], DISPUTED)

@@ -180,7 +180,7 @@ class Candidate:
     """A refined pose between the centred frames, with what speaks for it.
 
     start: where it came from; errors: mean |r| of the IC solver that led to it. support: see ``support``; weight:
-    what it weighs among the others; confidence: that it is right, given these.
+    what it weighs among the others; confidence: that it is right, given these. doubt: what another look has against it.
     """
 
     T_target_source: np.ndarray
@@ -190,6 +190,7 @@ class Candidate:
     support: float = 0.0
     weight: float = 0.0
     confidence: float = 0.0
+    doubt: str = ""
 
 
 @dataclass
@@ -268,7 +269,7 @@ class Judge:
 
 def doubts(pair: Pair, best: Candidate, rivals: Sequence[Candidate]) -> list[str]:
     """Why a pose is not beyond doubt, in words, the weightiest first. rivals: poses that fit about as well."""
-    e, said = best.evidence, []
+    e, said = best.evidence, [best.doubt] if best.doubt else []
     if rivals:
         more = f", and {len(rivals) - 1} more" if len(rivals) > 1 else ""
         said.append(f"fits about as well {in_words(pair, best, rivals[0])}{more}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, refinement
-from fmr_cli.registration.confidence import LIKELY, Judge
+from fmr_cli.registration.confidence import ALIGNED, LIKELY, Judge, in_words
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -21,15 +21,21 @@ from fmr_cli.registration.result import Stopwatch
 REFINED = 8  # hypotheses that are refined, of each look
 WORTH = 0.4  # of the best overlap score, that a hypothesis has at least to be refined, and a rough pose to be judged
 AGAIN = 4  # poses of a look, the best ones, that the next one judges on its own voxels
-SURE = 0.95  # once a pose is that sure, on coarse voxels or on fine ones, no more is looked at
-# The same on wide voxels, which don't tell bays of a rack or rows of seats from each other: on 1,400 made-up pairs 18
-# of 739 aligned poses were wrong so (16 of 709 without the wide look), 24 of 764 with SURE and with whatever is surer.
-SURE_WIDE = 0.97
 # A look: the voxel edge, times the one that suits, and keypoints. The first one is often sure already; the second one
 # has its voxels and what is described on them, and is most often sure of what the first one is not. The third one sees
-# what LiDAR scans share far from both sensors, where points lie so far apart that finer voxels hold no surface.
-FIRST, CLOSER, WIDER = (1.5, 250), (1.5, 1000), (2.8, 1000)
-FINE = ((1.0, 1000), (0.7, 1000))  # the last look: hypotheses from both, judged on the voxels of the first one
+# what LiDAR scans share far from both sensors, where points lie so far apart that finer voxels hold no surface. The
+# last one sees what tells places that look alike from each other. (What 0.7 times the voxel shows besides changed no
+# count: right or ``aligned`` pairs of little overlap of the dragon, a kitchen, a LiDAR, made-up streets and objects.)
+Look = tuple[float, int]
+FIRST, CLOSER, WIDER, FINE = (1.5, 250), (1.5, 1000), (2.8, 1000), (1.0, 1000)
+SURE = 0.95  # once a pose is that sure, no more is looked at
+# The same on wide voxels, which don't tell bays of a rack or rows of seats from each other.
+SURE_WIDE = 0.97
+COARSE = {FIRST: SURE, CLOSER: SURE, WIDER: SURE_WIDE}
+# Confidence at most of a pose that coarse voxels are surer of than fine ones, which have another or doubt it. On 1,400
+# made-up pairs 45 of 74 such poses with more than 0.7 by themselves were right (a script that is not in the project).
+DISPUTED = 0.6
+FEW = 500  # voxels; where a scan has more, the search has found nothing that local features had not
 ALIKE = 1.15  # ratio of the clouds' sizes along their axes, up to which they may overlap fully
 
 log = logging.getLogger(__name__)
@@ -45,19 +51,21 @@ def at_once(
 ) -> Judge:
     """Looks at all of the target, dearer ones while none is sure. first: what FIRST has found already.
 
-    Where none is sure, the last one has the last word.
+    Where none is sure, the last one has the last word, but for which pose is given where it is not ``aligned`` either.
     """
-    judges, looks = [first] if first else [], []
+    judges, looks = [first] if first else [], list[Look]()
     if isinstance(options.init, str) and options.init == "auto":
-        looks = [(WIDER, SURE_WIDE)]
-        if options.voxel_size is None:
-            looks = [(FIRST, SURE), (CLOSER, SURE), *looks][len(judges) :]
-    for detail, enough in looks:
+        looks = [WIDER] if options.voxel_size else [FIRST, CLOSER, WIDER][len(judges) :]
+    for look in looks:
         with suppress(RegistrationError):  # too few voxels of that size
-            judges.append(coarse_look(make_pair(source, target, options, threads, *detail), time, surest(judges)))
-            if judges[-1].sure(enough):
-                return finer(judges[-1]) if detail == WIDER else judges[-1]
-    return further(source, target, options, threads, time, former=surest(judges))
+            judges.append(coarse_look(make_pair(source, target, options, threads, *look), time, surest(judges)))
+            if judges[-1].sure(COARSE[look]):
+                return finer(judges[-1])
+    coarse = surest(judges)
+    fine = further(source, target, options, threads, time, former=coarse)
+    if not coarse or fine.sure(min(ALIGNED, coarse.best.confidence)):
+        return fine
+    return disputed(finer(coarse), fine)
 
 
 def surest(judges: list[Judge]) -> Judge | None:
@@ -65,10 +73,19 @@ def surest(judges: list[Judge]) -> Judge | None:
     return max((j for j in judges if j.candidates), key=lambda j: j.best.confidence, default=None)
 
 
+def disputed(coarse: Judge, fine: Judge) -> Judge:
+    """The coarse look, with at most DISPUTED confidence in any pose; the best one has what the fine look says of it."""
+    best, *others = (replace(c, confidence=min(c.confidence, DISPUTED)) for c in coarse.candidates)
+    same = coarse.pair.same(best.T_target_source, fine.best.T_target_source)
+    elsewhere = "bear it out less" if same else f"fit better {in_words(coarse.pair, best, fine.best)}"
+    return replace(coarse, candidates=[replace(best, doubt=f"finer voxels {elsewhere}"), *others])
+
+
 def finer(judge: Judge) -> Judge:
-    """A look on wide voxels, with its pair on CLOSER's: its own are too large to refine and describe its pose."""
-    wide = judge.pair
-    return replace(judge, pair=make_pair(wide.source, wide.target, wide.options, wide.threads, *CLOSER))
+    """The look; one on wide voxels with its pair on CLOSER's: its own are too large to refine and describe poses."""
+    pair = judge.pair
+    closer = make_pair(pair.source, pair.target, pair.options, pair.threads, *CLOSER)
+    return replace(judge, pair=closer) if pair.edge > closer.edge else judge
 
 
 def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None, known: float = 0.0) -> Judge:
@@ -98,26 +115,17 @@ def further(
     options: Options,
     threads: int,
     time: Stopwatch,
-    enough: float = SURE,
     former: Judge | None = None,
 ) -> Judge:
-    """What fine voxels find, until a pose has ``enough`` confidence.
-
-    former: what a look on coarse voxels has found.
-    """
-    judge = Judge(make_pair(source, target, options, threads, *FINE[0]))
+    """What fine voxels find, or the options' own start. former: what a look on coarse voxels has found."""
+    judge = Judge(make_pair(source, target, options, threads, *FINE))
     pair = judge.pair
     if not isinstance(options.init, str) or options.init in ("identity", "centroid"):
         return from_given(judge, options.init, time)
     look_again(judge, former, time)
     if options.init != "search":
-        for detail in FINE:
-            with suppress(RegistrationError):
-                seen = pair if detail == FINE[0] else make_pair(source, target, options, threads, *detail)
-                consider(judge, features(seen, time), time)
-            if judge.sure(enough):
-                return judge
-    if options.init == "search" or (options.init == "auto" and not likely(judge) and may_overlap_fully(pair)):
+        consider(judge, features(pair, time), time)
+    if options.init == "search" or (options.init == "auto" and not likely(judge) and may_need_search(pair)):
         with time.stage("search"):
             found = hypotheses.from_search(pair)
         consider(judge, found, time)
@@ -185,6 +193,11 @@ def judge_refined(judge: Judge, found: list[Hypothesis]) -> None:
 def likely(judge: Judge) -> bool:
     """Whether the best pose would be called right if it were alone."""
     return bool(judge.candidates) and judge.best.support >= LIKELY
+
+
+def may_need_search(pair: Pair) -> bool:
+    """Whether few voxels hold points, so that local features say little, and the clouds may overlap fully."""
+    return min(len(pair.s.points), len(pair.t.points)) < FEW and may_overlap_fully(pair)
 
 
 def may_overlap_fully(pair: Pair) -> bool:

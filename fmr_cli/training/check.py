@@ -150,7 +150,7 @@ def outcome(ends: tuple[Prepared, Prepared], truth: np.ndarray, options: Options
     off = np.linalg.norm(transform_points(found.T_target_source, points) - transform_points(truth, points), axis=1)
     degrees = angle_degrees(np.linalg.inv(truth) @ found.T_target_source)
     size = float(np.ptp(target.points, axis=0).max())
-    pair = make_pair(source, target, options, 1, *FINE[0])
+    pair = make_pair(source, target, options, 1, *FINE)
     matches = pair.inlier_count(pair.enter_centred(truth)) / max(len(pair.matches[0]), 1)
     p = min(max(found.confidence, 1e-9), 1 - 1e-9)
     right = degrees <= RIGHT_DEGREES and off.mean() < RIGHT_SHARE * size

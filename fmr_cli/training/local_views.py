@@ -24,7 +24,7 @@ from fmr_cli.cores import usable_cores
 from fmr_cli.descriptors.patch_encoder import NEIGHBOURS, PATCH_POINTS, PATCH_RADIUS, describe_patches
 from fmr_cli.geometry.sampling import working_scale
 from fmr_cli.geometry.surface import Surface
-from fmr_cli.registration.looks import FINE, WIDER
+from fmr_cli.registration.looks import WIDER
 from fmr_cli.synthetic.calibration_pairs import bent_pair
 from fmr_cli.synthetic.draft import log_uniform
 from fmr_cli.synthetic.pairs import degrade, scan_pair
@@ -32,7 +32,7 @@ from fmr_cli.synthetic.verdict_pairs import FAMILIES, make_pair
 
 LEAST_POINTS = 500  # of a scan: fewer hardly fill a hundred patches
 LEAST_PATCHES = 16  # of a pair: fewer are hardly each other's negatives
-VOXELS = min(FINE)[0], WIDER[0]  # times the working voxel: all that ``align`` looks at
+VOXELS = 0.7, WIDER[0]  # times the working voxel: all that ``align`` looks at, and somewhat finer
 HARD = 0.5  # of the pairs
 BENT = 0.6  # of the hard pairs
 KEYPOINTS = 1000  # of a scan, among which places are drawn: as many as ``align`` matches

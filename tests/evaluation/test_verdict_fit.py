@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from fmr_cli.evaluation.verdict import calibration_error
-from fmr_cli.evaluation.verdict_evidence import Judged, pair_evidence
+from fmr_cli.evaluation.verdict_evidence import Judged, decisive, pair_evidence
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
-from fmr_cli.registration.confidence import DETAIL, MISSING, QUALITY, SHARE, STRETCH
+from fmr_cli.registration.confidence import ALIGNED, DETAIL, MISSING, QUALITY, SHARE, STRETCH
+from fmr_cli.registration.looks import CLOSER, DISPUTED, FINE, FIRST, SURE, WIDER
 from fmr_cli.report.calibration import calibration_table, plot_calibration
 from fmr_cli.synthetic.calibration_pairs import DRAWN
 
@@ -27,7 +28,7 @@ def drawn() -> list[Judged]:
         x[:, bounding] = np.abs(x[:, bounding])  # nothing that bounds a confidence by itself
         right = np.zeros(3, bool)
         right[0] = rng.random() < 1 / (1 + np.exp(-2 * x[0, 1]))
-        looks.append(Judged(x, right, np.zeros(3), "drawn", True, number))
+        looks.append(Judged(x, right, np.zeros(3), FIRST, "drawn", True, number))
     return looks
 
 
@@ -67,8 +68,24 @@ def test_the_plot_is_a_png(tmp_path, drawn):
 
 def test_a_pair_gives_the_same_evidence_every_time_and_one_of_its_poses_is_right():
     first, again = (pair_evidence((42_000, DRAWN.index("copy"))) for _ in range(2))
-    assert len(first) == 3  # looks
+    assert [judged.look for judged in first] == [FIRST, CLOSER, WIDER, FINE]
     for a, b in zip(first, again, strict=True):
         assert (a.x == b.x).all()
         assert (a.right == b.right).all()
         assert a.right.any()
+
+
+def test_the_first_look_that_is_sure_decides_and_a_wide_one_has_to_be_surer():
+    said = {FIRST: 0.2, CLOSER: SURE, WIDER: 1.0, FINE: 1.0}
+    assert decisive(said) == (CLOSER, SURE)
+    assert decisive(said | {FIRST: SURE}) == (FIRST, SURE)
+    assert decisive(said | {CLOSER: 0.9}) == (WIDER, 1.0)
+    assert decisive(said | {CLOSER: 0.9, WIDER: SURE}) == (FINE, 1.0)
+
+
+def test_fine_voxels_alone_call_aligned_what_no_coarse_look_is_sure_of():
+    said = {FIRST: 0.1, CLOSER: 0.9, WIDER: 0.5}
+    assert decisive(said | {FINE: ALIGNED}) == (FINE, ALIGNED)
+    assert decisive(said | {FINE: 0.3}) == (CLOSER, DISPUTED)
+    assert decisive({FIRST: 0.1, FINE: 0.3}) == (FINE, 0.3)
+    assert decisive({FINE: 0.3}) == (FINE, 0.3)

@@ -1,0 +1,62 @@
+"""Looks at a pair: which one decides, and what is said where two of them disagree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fmr_cli import PointCloud, align
+from fmr_cli.registration import hypotheses, looks
+from fmr_cli.registration.confidence import ALIGNED, Judge, doubts
+from fmr_cli.registration.options import Options
+from fmr_cli.registration.pair import make_pair
+from fmr_cli.registration.pipeline import prepare
+from fmr_cli.registration.prepared import Prepared
+
+Scans = tuple[np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def scans(room_scans: Scans) -> tuple[Prepared, Prepared]:
+    source, target = (prepare(PointCloud(points[::3])) for points in room_scans)
+    return source, target
+
+
+def looked(scans: tuple[Prepared, Prepared], look: looks.Look, confidence: float, shift: float = 0.0) -> Judge:
+    """A look at the scans whose one pose has that confidence, ``shift`` away from where they were taken."""
+    judge = Judge(make_pair(*scans, Options(), 1, *look))
+    T = judge.pair.enter_centred(np.eye(4))
+    T[0, 3] += shift
+    judge.consider(T, "features", [])
+    judge.candidates = [replace(judge.best, confidence=confidence)]
+    return judge
+
+
+@pytest.mark.parametrize(("shift", "reason"), [(0.0, "bear it out less"), (1.0, "fit better shifted by 1 along")])
+def test_a_pose_that_fine_voxels_do_not_bear_out_is_given_with_a_doubt(
+    scans: tuple[Prepared, Prepared], shift: float, reason: str
+) -> None:
+    coarse, fine = looked(scans, looks.CLOSER, 0.94), looked(scans, looks.FINE, 0.2, shift)
+    judge = looks.disputed(coarse, fine)
+    assert judge.best.T_target_source.tolist() == coarse.best.T_target_source.tolist()
+    assert judge.best.confidence == looks.DISPUTED < ALIGNED
+    assert doubts(judge.pair, judge.best, [])[0].startswith(f"finer voxels {reason}")
+
+
+def test_a_wide_look_is_refined_on_finer_voxels_and_others_on_their_own(scans: tuple[Prepared, Prepared]) -> None:
+    closer = looked(scans, looks.CLOSER, 0.9)
+    assert looks.finer(closer) is closer
+    assert looks.finer(looked(scans, looks.WIDER, 0.9)).pair.edge == closer.pair.edge
+
+
+@pytest.mark.parametrize(("points", "searched"), [(150, True), (6000, False)])
+def test_the_global_feature_is_searched_by_default_where_points_are_few(
+    points: int, searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, asked = np.random.default_rng(3), []
+    monkeypatch.setattr(hypotheses, "from_search", lambda pair: asked.append(pair) or [])
+    source, target = (PointCloud(rng.uniform(-1, 1, (points, 3))) for _ in range(2))  # of one size, and unlike
+    assert align(source, target, hints=False).status == "uncertain"
+    assert bool(asked) == searched
