@@ -88,4 +88,5 @@ def test_fine_voxels_alone_call_aligned_what_no_coarse_look_is_sure_of():
     assert decisive(said | {FINE: ALIGNED}) == (FINE, ALIGNED)
     assert decisive(said | {FINE: 0.3}) == (CLOSER, DISPUTED)
     assert decisive({FIRST: 0.1, FINE: 0.3}) == (FINE, 0.3)
+    assert decisive({FIRST: 0.01, FINE: 0.3}) == (FIRST, 0.01)  # hopeless
     assert decisive({FINE: 0.3}) == (FINE, 0.3)

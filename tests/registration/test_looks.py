@@ -60,3 +60,15 @@ def test_the_global_feature_is_searched_by_default_where_points_are_few(
     source, target = (PointCloud(rng.uniform(-1, 1, (points, 3))) for _ in range(2))  # of one size, and unlike
     assert align(source, target, hints=False).status == "uncertain"
     assert bool(asked) == searched
+
+
+@pytest.mark.parametrize(("points", "hopeless", "looked_at"), [(6000, 1.0, False), (6000, 0.0, True), (150, 1.0, True)])
+def test_a_hopeless_pair_gets_no_fine_look_unless_its_points_are_few(
+    points: int, hopeless: float, looked_at: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, asked, further = np.random.default_rng(5), [], looks.further
+    monkeypatch.setattr(looks, "further", lambda *args, **given: asked.append(args) or further(*args, **given))
+    monkeypatch.setattr(looks, "HOPELESS", hopeless)
+    source, target = (PointCloud(rng.uniform(-1, 1, (points, 3))) for _ in range(2))
+    assert align(source, target, hints=False).status == "uncertain"
+    assert bool(asked) == looked_at
