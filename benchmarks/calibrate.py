@@ -20,7 +20,7 @@ import numpy as np
 
 from fmr_cli.evaluation.verdict import calibration_error
 from fmr_cli.evaluation.verdict_evidence import Judged, decisive, gather
-from fmr_cli.evaluation.verdict_fit import cross_validated, fit
+from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
 from fmr_cli.registration.confidence import (
     ALIGNED,
     BARE,
@@ -37,6 +37,7 @@ from fmr_cli.registration.confidence import (
     standing,
 )
 from fmr_cli.registration.looks import COARSE, FINE, Look
+from fmr_cli.registration.models import model
 from fmr_cli.registration.verdict_weights import Weights
 from fmr_cli.report.calibration import calibration_table, plot_calibration
 
@@ -77,7 +78,7 @@ def decisions(evidence: Sequence[Judged], confidence: np.ndarray, right: np.ndar
     named = "; ".join(f"{count} {kind}" for kind, count in kinds.most_common())
     ended = Counter(look for _, look, _ in ends)
     return [
-        f"as align decides: {kinds.total()} of {aligned.sum()} aligned poses are wrong ({named or 'none'}), "
+        f"{kinds.total()} of {aligned.sum()} aligned poses are wrong ({named or 'none'}), "
         f"{(aligned & good & unique).sum()} of {(good & unique).sum()} unique right ones are aligned, "
         f"expected calibration error {calibration_error(said, good):.3f}",
         "pairs by the look they end at: " + ", ".join(f"{look}: {ended[look]}" for look in (*COARSE, FINE)),
@@ -99,7 +100,9 @@ def main() -> None:
     print(f"{len(evidence)} looks at {args.pairs} pairs, each judged by weights fitted on others:")
     print(calibration_table(confidence, right))
     print(f"expected calibration error {calibration_error(confidence, right):.3f}")
-    print(*decisions(evidence, confidence, right), sep="\n")
+    print("as align decides:", *decisions(evidence, confidence, right), sep="\n")
+    print("by the bundled weights, which may have seen such pairs:")
+    print(*decisions(evidence, *judge(evidence, model(None).verdict)), sep="\n")
     weights = fit(evidence)
     for line in bounds_in(evidence, weights):
         print(line)
