@@ -12,6 +12,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.sequence.scans import Scans
 from fmr_cli.workers.local import Pool
+from fmr_cli.workers.memory import keep_freed_memory
 
 # Scans, from which a process is worth its start, which takes half a second of a core that else lies idle.
 WORTH_A_PROCESS = 16
@@ -70,3 +71,5 @@ def from_process(future: Future[Done], task: Callable[..., Done], *given: Any) -
 def start() -> None:
     """The first task of a process: when it is done, Python and what is imported with the sequences are there."""
     import fmr_cli.sequence.loader  # noqa: F401
+
+    keep_freed_memory()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import queue
 import time
 from collections import deque
@@ -10,12 +9,12 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from fmr_cli.errors import FmrError
 from fmr_cli.workers.base import AHEAD, LostError, UnfitError
+from fmr_cli.workers.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from fmr_cli.workers.cluster import DaskWorkers
@@ -25,7 +24,6 @@ FETCH = 20.0  # s that a worker has to hand over an answer that is ready
 TICK = 0.5  # s after which workers are looked at although no answer has come
 # A task is late when it takes longer than so many seconds and so many times as long as the slowest one so far.
 PATIENCE, SLOWER = 30.0, 4.0
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 COPIES = 3  # of a late task, at most; and of tries of one that a worker cannot run
 
 
@@ -185,23 +183,11 @@ class Handing:
                 raise FmrError(f"--dask {self.workers.name}: a task cannot be run there ({what})")
 
 
-@cache
-def keep_freed_memory() -> None:
-    """Undoes, in this process, what Dask's nanny asks of glibc: to give freed memory back at once (trim at 64 kB).
-
-    Every array of a pair would then be new pages of the system, which takes longer than the work on them.
-    """
-    with suppress(OSError, AttributeError):  # another C library
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_MMAP_THRESHOLD, 32 << 20)  # what glibc itself goes up to
-        mallopt(M_TRIM_THRESHOLD, 64 << 20)
-
-
 def call(work: tuple[Callable[[Any], Any], Any]) -> Came:
     """On the worker: a function and its task."""
     from distributed import get_worker
 
-    keep_freed_memory()
+    keep_freed_memory()  # Dask's nanny has asked for all of it to be given back at once (trim at 64 kB)
     function, task = work
     worker = get_worker().address
     try:
