@@ -49,6 +49,7 @@ class NumpyEncoder:
         self.layers = layers
         self._transposed = [np.ascontiguousarray(W.T) for W, _ in layers]
         self._own = threading.local()
+        self._unmoved = self.posed(np.eye(4))
 
     def __call__(self, points: np.ndarray, threads: int = 1) -> np.ndarray:
         """F: (N, 3) -> (K,)."""
@@ -57,7 +58,7 @@ class NumpyEncoder:
     def encode(self, points: np.ndarray, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """F and the critical points: (N, 3) -> feature (K,), index (K,) of the point that set each channel."""
         with spread(threads) as run:
-            feature, index = self.peaks(points.astype(np.float32), np.eye(4)[None], run)
+            feature, index = self.peaks(points.astype(np.float32), [self._unmoved], run)
         return feature[0], index[0]
 
     def posed(self, g: np.ndarray) -> Layers:
@@ -91,9 +92,8 @@ class NumpyEncoder:
             x = np.maximum(out, -b, out=out)
         return np.matmul(layers[-1][0], x.T, out=last.reshape(-1, len(points)))
 
-    def peaks(self, points: np.ndarray, g: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
-        """F of the points (N, 3) float32 moved by each g (S, 4, 4), and its critical points: (S, K), (S, K)."""
-        posed = [self.posed(T) for T in g]
+    def peaks(self, points: np.ndarray, posed: list[Layers], run: Run) -> tuple[np.ndarray, np.ndarray]:
+        """F of the points (N, 3) float32 by each of S ``posed`` layers, and its critical points: (S, K), (S, K)."""
         channels = np.arange(len(self.layers[-1][1]))
 
         def part(job: tuple[int, slice]) -> tuple[np.ndarray, np.ndarray]:
@@ -101,8 +101,8 @@ class NumpyEncoder:
             index = values.argmax(1)
             return values[channels, index], index + job[1].start
 
-        parts = list(run(part, jobs(len(g), len(points))))
-        value, index = (np.array(x).reshape(len(g), -1, len(channels)) for x in zip(*parts, strict=True))
+        parts = list(run(part, jobs(len(posed), len(points))))
+        value, index = (np.array(x).reshape(len(posed), -1, len(channels)) for x in zip(*parts, strict=True))
         best = value.argmax(1)[:, None]
         value, index = (np.take_along_axis(x, best, 1)[:, 0] for x in (value, index))
         return value + np.array([layers[-1][1] for layers in posed]), index

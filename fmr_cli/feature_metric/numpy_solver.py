@@ -75,7 +75,7 @@ class NumpySolver(NumpyEncoder):
         """``solve`` with all points in every iteration: source float32, g float64."""
 
         def look(g: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
-            feature, index = self.peaks(source, g, run)
+            feature, index = self.peaks(source, [self.posed(T) for T in g], run)
             return feature, self.jacobians(source, index, g) if derivative else None
 
         return iterate(look, template, g, iterations, robust, basis)
@@ -107,7 +107,7 @@ class NumpySolver(NumpyEncoder):
         active, near, seen, missed = few(source), False, None, np.inf
         errors, iteration, end, size = [], 0, iterations, np.inf
         while True:
-            feature, critical = (x[0] for x in self.peaks(active, g, run))
+            feature, critical = (x[0] for x in self.peaks(active, [self.posed(T) for T in g], run))
             finished = iteration >= end or size < STOP_STEP
             far = (
                 np.inf
@@ -120,7 +120,7 @@ class NumpySolver(NumpyEncoder):
                 missed = float(np.mean(whole - feature))
                 active, feature, near, seen = source[index], whole, True, g if close else None
                 if robust:  # whose step needs to know the points behind the feature
-                    critical = self.peaks(active, g, run)[1][0]
+                    critical = self.peaks(active, [self.posed(T) for T in g], run)[1][0]
             elif finished:
                 missed = 0.0
             r = feature - template.feature
