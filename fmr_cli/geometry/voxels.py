@@ -14,9 +14,12 @@ def voxel_downsample(points: np.ndarray, edge: float) -> np.ndarray:
     """
     if not len(points):
         return points.copy()
-    rank = voxel_ranks(points, edge)
-    count = np.bincount(rank)
-    return np.stack([np.bincount(rank, c) for c in points.T], 1) / count[:, None]
+    return voxel_means(points, voxel_ranks(points, edge))
+
+
+def voxel_means(values: np.ndarray, rank: np.ndarray) -> np.ndarray:
+    """The mean of values (N, d) in each voxel, by the ``voxel_ranks`` (N,) of their points: (M, d)."""
+    return np.stack([np.bincount(rank, c) for c in values.T], 1) / np.bincount(rank)[:, None]
 
 
 def voxel_ranks(points: np.ndarray, edge: float) -> np.ndarray:

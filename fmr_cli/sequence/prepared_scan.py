@@ -13,7 +13,7 @@ import small_gicp
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.normals import principal_variances, smallest_eigenvector
-from fmr_cli.geometry.voxels import voxel_keys
+from fmr_cli.geometry.voxels import voxel_means, voxel_ranks
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 if TYPE_CHECKING:
@@ -40,6 +40,9 @@ MANY_NEIGHBOURS = 30  # ... and where a scanner's rings lie so far apart that th
 LINE = 0.1
 SPARSE = 0.15  # share of a scan's points whose neighbours are a line, from which more neighbours are asked
 TILT = 3.0  # times the scan's median error, at which a normal is half trusted
+# Voxels from the origin, 700 km for a scanner in a street: what lies beyond is no measurement, and two million voxels
+# are as many as ``voxel_keys`` tells apart.
+FARTHEST = 1 << 20
 FEW = 128  # points that a scan's global feature is made of: enough to tell poses apart, under 1 ms
 MIN_POINTS = 50  # of a thinned scan, below which registration is not worth a try; set by hand
 # Times the edge that the density asks for, or divided by it: so far a wish is followed, set by hand. Finer voxels hold
@@ -54,21 +57,26 @@ EDGE_PER_COUNT = 0.6
 class PreparedScan:
     """A scan in voxels: thinned ``points`` (N, 3), unit ``normals`` towards the sensor, ``ranges`` (N,) from it.
 
-    ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing. ``whole``: (M, 3) float32,
-    the points before thinning. It can be pickled until one of its clouds was asked for. ``when``: (N,), when the points
+    ``solid`` (N,), False where the neighbours are a line, so that the normal means nothing; ``tilt`` (N,), rad, how far
+    they stray from their plane, seen from where they lie along it. ``whole``: (M, 3) float32, the points before
+    thinning. It can be pickled until one of its clouds was asked for. ``when``: (N,), when the points
     were measured, 0 to 1 over the scan, or None.
     """
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray, times: np.ndarray | None = None) -> None:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels. times: (M,), 0 to 1 over the scan."""
+        if max(points.max(), -points.min()) > FARTHEST:
+            near = (np.abs(points) <= FARTHEST).all(1)
+            points, times = points[near], None if times is None else times[near]
         self.whole = points.astype(np.float32)
-        # Copied, because the thinned cloud has room for all points: some 20 MB for as long as the scan is kept.
-        self.points = np.array(small_gicp.voxelgrid_sampling(points, 1.0).points()[:, :3], order="C")
-        self.when = None if times is None else mean_by_voxel(points, times, self.points)
+        rank = voxel_ranks(points, 1.0)
+        self.points = voxel_means(points, rank)
+        self.when = None if times is None else voxel_means(times[:, None], rank)[:, 0]
         tree = small_gicp.KdTree(self.points)
-        self._scatter = scatter(self.points, neighbours(tree, self.points, NEIGHBOURS))
-        self.normals = smallest_eigenvector(*self._scatter)[0]
-        self.solid = ~lines(self._scatter)
+        six = scatter(self.points, neighbours(tree, self.points, NEIGHBOURS))
+        self.normals = smallest_eigenvector(*six)[0]
+        self.solid = ~lines(six)
+        self.tilt = tilt(six)
         self._neighbours = NEIGHBOURS  # of the covariances of ``cloud``
         if len(self.points) > MANY_NEIGHBOURS and not self.solid.all():
             self._look_wider(tree)
@@ -103,12 +111,6 @@ class PreparedScan:
     def __len__(self) -> int:
         return len(self.points)
 
-    @cached_property
-    def tilt(self) -> np.ndarray:
-        """(N,), rad: how far the neighbours of a point stray from their plane, seen from where they lie along it."""
-        least, middle, _ = principal_variances(*self._scatter)
-        return np.sqrt(np.maximum(least, 0) / np.maximum(middle, 1e-12))
-
     def trust(self, at_least: float = 0.0) -> np.ndarray:
         """(N,), 0 to 1: how far a normal can be trusted, beside the median of the same scan, or a tilt ``at_least``.
 
@@ -119,8 +121,9 @@ class PreparedScan:
 
     @cached_property
     def few(self) -> np.ndarray:
-        """(M, 3): FEW of the points, or all where there are fewer."""
-        return self.points[np.sort(np.random.default_rng(0).permutation(len(self.points))[:FEW])]
+        """(M, 3): FEW of the points, or all where there are fewer; even in their order, so alike in every scan."""
+        count = len(self.points)
+        return self.points[np.arange(min(FEW, count)) * count // min(FEW, count)]
 
     @cached_property
     def box(self) -> tuple[np.ndarray, float]:
@@ -147,14 +150,6 @@ class PreparedScan:
         from fmr_cli.registration.pipeline import prepare
 
         return prepare(PointCloud(self.whole.astype(float)))
-
-
-def mean_by_voxel(points: np.ndarray, values: np.ndarray, thinned: np.ndarray) -> np.ndarray:
-    """The mean value (N,) in the voxel of each of the thinned points (N, 3); values: (M,) of the points (M, 3)."""
-    keys, inverse = np.unique(voxel_keys(points, 1.0), return_inverse=True)
-    means = np.bincount(inverse, values) / np.bincount(inverse)
-    place = np.minimum(np.searchsorted(keys, voxel_keys(thinned, 1.0)), len(keys) - 1)  # rounding may leave a voxel
-    return means[place]
 
 
 def with_covariances(points: np.ndarray, count: int) -> small_gicp.PointCloud:
@@ -186,6 +181,12 @@ def lines(six: np.ndarray) -> np.ndarray:
     xx, yy, zz, xy, xz, yz = six
     minors = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
     return minors < LINE / (1 + LINE) ** 2 * (xx + yy + zz) ** 2
+
+
+def tilt(six: np.ndarray) -> np.ndarray:
+    """(N,), rad: how far neighbourhoods stray from their planes, seen from where they lie along them (``scatter``)."""
+    least, middle, _ = principal_variances(*six)
+    return np.sqrt(np.maximum(least, 0) / np.maximum(middle, 1e-12))
 
 
 def prepare_scan(points: np.ndarray, frame: VoxelFrame, times: np.ndarray | None = None) -> PreparedScan | None:
