@@ -163,7 +163,7 @@ class LocalMap:
         if clear:
             return clear
         which = matches.index
-        seen = observe(matches, scan.trust()[which], np.full(len(which), wrong))
+        seen = observe(matches, scan.trust()[which], wrong)
         if seen.observed.all():
             return seen
         # Beside flawless walls an edge is no worse than elsewhere, and normals no more wrong than their neighbours say.

@@ -17,6 +17,7 @@ the tests hold what they give there and on real drives.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -51,6 +52,19 @@ class Matches:
     weight: np.ndarray
     rms: float
     distance: np.ndarray
+
+    @cached_property
+    def pivot(self) -> np.ndarray:
+        """(3,): their middle, so that no arm is much longer than it need be."""
+        return self.moved.mean(0)
+
+    @cached_property
+    def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
+        """(6, N) each, about the pivot: what each point says about a motion, by the map's normal and by its own."""
+        by_map, by_scan = (
+            linearise(self.moved, self.moved, n, self.pivot)[1] for n in (self.map_normals, self.scan_normals)
+        )
+        return by_map, by_scan
 
 
 @dataclass(frozen=True)
@@ -94,39 +108,39 @@ class Observability:
 
 
 @dataclass(frozen=True)
-class Jacobians:
-    """What each matched point says about a motion, once by the map's normal and once by its own.
+class Weighed:
+    """What weighted matches say about a motion about their centre, rotations as displacements at ``radius``.
 
-    centre, radius: as in ``Observability``. by_map, by_scan: (6, N), rotations as displacements at ``radius``.
-    weight: (N,).
+    centre, radius: as in ``Observability``. about: (6, 6), a Jacobian of ``Matches`` as one about the centre. by_map:
+    (6, 6), information by the map's normals alone, with all that is wrong with them; by_both: by the one Jacobian times
+    the other, what is real of it.
     """
 
     centre: np.ndarray
     radius: float
+    about: np.ndarray
     by_map: np.ndarray
-    by_scan: np.ndarray
-    weight: np.ndarray
+    by_both: np.ndarray
 
     @classmethod
-    def of(cls, matches: Matches, weight: np.ndarray) -> Jacobians:
-        centre = np.average(matches.moved, axis=0, weights=weight)
-        radius = float(np.sqrt(np.average(((matches.moved - centre) ** 2).sum(1), weights=weight)))
-        both = [
-            linearise(matches.moved, matches.moved, n, centre)[1] for n in (matches.map_normals, matches.scan_normals)
-        ]
-        scale = np.array([radius] * 3 + [1.0] * 3)[:, None]
-        return cls(centre, radius, both[0] / scale, both[1] / scale, weight)
+    def of(cls, matches: Matches, weight: np.ndarray) -> Weighed:
+        """weight: (N,)."""
+        arm = matches.moved - matches.pivot
+        offset = weight @ arm / weight.sum()
+        radius = float(np.sqrt(weight @ ((arm - offset) ** 2).sum(1) / weight.sum()))
+        about = np.eye(6)
+        about[:3, 3:] = np.cross(offset, np.eye(3))
+        about[:3] /= radius
+        by_map, by_scan = matches.jacobians
+        weighed = by_map * weight
+        H, cross = (about @ (weighed @ J.T) @ about.T for J in (by_map, by_scan))
+        return cls(matches.pivot + offset, radius, about, H, (cross + cross.T) / 2)
 
-    def information(self) -> tuple[np.ndarray, np.ndarray]:
-        """(6, 6) each: by the map's normals alone, with all that is wrong with them; and by both, with what is real."""
-        H = (self.by_map * self.weight) @ self.by_map.T
-        cross = (self.by_map * self.weight) @ self.by_scan.T
-        return H + 1e-9 * np.trace(H) * np.eye(6), (cross + cross.T) / 2
-
-    def observability(self, H: np.ndarray, cross: np.ndarray, rms: float) -> Observability:
-        """The directions v with cross v = reliability H v, which mix neither in the one nor in the other."""
+    def observability(self, pretended: np.ndarray | float, rms: float) -> Observability:
+        """The directions v with by_both v = reliability (by_map + pretended) v, mixed in neither of the two."""
+        H = self.by_map + 1e-9 * np.trace(self.by_map) * np.eye(6) + pretended
         root = np.linalg.cholesky(H)
-        whitened = np.linalg.solve(root, np.linalg.solve(root, cross).T)
+        whitened = np.linalg.solve(root, np.linalg.solve(root, self.by_both).T)
         reliability, vectors = np.linalg.eigh((whitened + whitened.T) / 2)
         directions = np.linalg.solve(root.T, vectors)
         facing = reliability / np.linalg.norm(directions, axis=0) ** 2  # so many points would weigh as much
@@ -143,36 +157,34 @@ def clearly_observed(matches: Matches, wrong: float) -> Observability | None:
 
     wrong: radians that the normals of both sides are wrong by together.
     """
-    jacobians = Jacobians.of(matches, matches.weight)
-    H, cross = jacobians.information()
-    if np.linalg.eigvalsh(cross)[0] < max(CLEAR, CLEAR_TIMES * wrong**2) * matches.weight.sum():
+    weighed = Weighed.of(matches, matches.weight)
+    if np.linalg.eigvalsh(weighed.by_both)[0] < max(CLEAR, CLEAR_TIMES * wrong**2) * matches.weight.sum():
         return None
-    return jacobians.observability(H, cross, matches.rms).as_observed()
+    return weighed.observability(0.0, matches.rms).as_observed()
 
 
-def observe(matches: Matches, trust: np.ndarray, wrong: np.ndarray) -> Observability:
+def observe(matches: Matches, trust: np.ndarray, wrong: np.ndarray | float) -> Observability:
     """The same, however weak; trust: (N,), 0 to 1, in their normals; wrong: (N,), rad, what these are wrong by."""
-    jacobians = Jacobians.of(matches, matches.weight * trust)
-    H, cross = jacobians.information()
-    arm = (matches.moved - jacobians.centre) / jacobians.radius
-    pretended = across(arm, replace(jacobians, weight=jacobians.weight * wrong**2))
-    return jacobians.observability(H + pretended, cross, matches.rms)
+    weighed = Weighed.of(matches, matches.weight * trust)
+    pretended = across(matches, matches.weight * trust * wrong**2, weighed)
+    return weighed.observability(pretended, matches.rms)
 
 
-def across(arm: np.ndarray, jacobians: Jacobians) -> np.ndarray:
+def across(matches: Matches, weight: np.ndarray, weighed: Weighed) -> np.ndarray:
     """(6, 6): the information that normals pretend which are wrong by 1 in every direction across them.
 
-    arm: (N, 3), points about their centre over their radius. With the Jacobian (arm × e, e) of an error e, this is
-    Σ w (G Gᵀ - g gᵀ), G = [hat(arm); I], g = (arm × n, n).
+    weight: (N,). With arm, the points about the centre over the radius, and the Jacobian (arm × e, e) of an error e,
+    this is Σ w (G Gᵀ - g gᵀ), G = [hat(arm); I], g = (arm × n, n).
     """
-    weight = jacobians.weight
+    arm = (matches.moved - weighed.centre) / weighed.radius
     moment, second = weight @ arm, (arm * weight[:, None]).T @ arm
     all_sides = np.zeros((6, 6))
     all_sides[:3, :3] = np.trace(second) * np.eye(3) - second
     all_sides[3:, 3:] = weight.sum() * np.eye(3)
     all_sides[:3, 3:] = np.cross(moment, np.eye(3)).T
     all_sides[3:, :3] = all_sides[:3, 3:].T
-    return all_sides - (jacobians.by_map * weight) @ jacobians.by_map.T
+    by_map = matches.jacobians[0]
+    return all_sides - weighed.about @ ((by_map * weight) @ by_map.T) @ weighed.about.T
 
 
 def in_words(twists: np.ndarray, radius: float) -> list[str]:

@@ -155,7 +155,7 @@ class PreparedScan:
 def with_covariances(points: np.ndarray, count: int) -> small_gicp.PointCloud:
     """Points (N, 3) for small_gicp, with the covariance of each one's nearest, so many of them."""
     cloud = small_gicp.PointCloud(points)
-    small_gicp.estimate_normals_covariances(cloud, num_neighbors=count)
+    small_gicp.estimate_covariances(cloud, num_neighbors=count)
     return cloud
 
 

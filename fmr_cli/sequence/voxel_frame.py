@@ -40,7 +40,9 @@ class VoxelFrame:
 
     def points_to_voxels(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) of a scan, file units to voxels."""
-        return (points - self.origin) / self.voxel
+        moved = points - self.origin
+        moved /= self.voxel
+        return moved
 
     def pose_to_file(self, T_map_scan: np.ndarray) -> np.ndarray:
         """T_first_scan (4, 4), file units, of T_map_scan (4, 4), voxels."""
