@@ -13,7 +13,7 @@ import small_gicp
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.normals import principal_variances, smallest_eigenvector
-from fmr_cli.geometry.voxels import voxel_means, voxel_ranks
+from fmr_cli.geometry.voxels import voxel_downsample, voxel_means, voxel_ranks
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ def suitable_voxel(points: np.ndarray) -> float:
         raise RegistrationError("too few points, or all in one place")
     voxel, centred = spread / 20, points - np.median(points, axis=0)
     for _ in range(STEPS):
-        count = small_gicp.voxelgrid_sampling(centred / voxel, 1.0).size()
+        count = 1 + int(voxel_ranks(centred, voxel).max())
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
             break
         voxel *= (count / wanted) ** EDGE_PER_COUNT
@@ -244,11 +244,10 @@ def grain(points: np.ndarray) -> tuple[float, float]:
     The median distance to the tenth neighbour; and how far the flattest quarter of the neighbourhoods strays from its
     planes (standard deviation), lines left out.
     """
-    thinned = small_gicp.voxelgrid_sampling(points, 1.0)
-    if thinned.size() <= NEIGHBOURS:
+    points = voxel_downsample(points, 1.0)
+    if len(points) <= NEIGHBOURS:
         return 0.0, 0.0
-    points = thinned.points()[:, :3]
-    index, squared = small_gicp.KdTree(thinned).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
+    index, squared = small_gicp.KdTree(points).batch_knn_search(points[::GRAIN_EVERY], NEIGHBOURS)
     least, middle, most = principal_variances(*scatter(points, index.astype(np.int64)))
     flat = np.maximum(least[middle > LINE * most], 0)
     return float(np.sqrt(np.median(squared[:, -1]))), float(np.sqrt(np.quantile(flat, 0.25))) if len(flat) else 0.0
