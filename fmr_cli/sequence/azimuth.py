@@ -18,7 +18,7 @@ from fmr_cli.errors import CloudFileError
 from fmr_cli.geometry.point_to_plane import linearise
 from fmr_cli.geometry.se3 import adjoint, exp, log
 from fmr_cli.sequence.local_map import COARSE, FINE, WIDE, LocalMap
-from fmr_cli.sequence.moving_scan import MovingScan
+from fmr_cli.sequence.moving_scan import MovingScan, Within
 from fmr_cli.sequence.observability import LEAST_SIGMA, Matches
 from fmr_cli.sequence.prepared_scan import PreparedScan, prepare_scan
 from fmr_cli.sequence.scans import Scans
@@ -144,8 +144,8 @@ class Place:
         """Of one; clouds: the scans as they were read."""
         still = []
         for cloud, motion in zip(clouds, self.motions(), strict=True):
-            T_begin_end = exp(frame.twist_to_file(likely.share * motion))
-            scan = MovingScan(cloud, likely.times(cloud.points), T_begin_end, likely.share, frame).prepared()
+            within = Within(exp(frame.twist_to_file(likely.share * motion)))
+            scan = MovingScan(cloud, likely.times(cloud.points), within, likely.share, frame).prepared()
             if scan is None:
                 return 0.0
             still.append(scan)

@@ -14,7 +14,9 @@ ROUNDS = 3  # of making the scan ready by a better motion, at most
 # Of the scan's distance from the map's planes, how far its ends may yet move against each other, half to either side,
 # before it is made ready again: a quarter of what noise does.
 LEFT = 0.5
-SETTLED = 0.5 * FINE  # the ends have moved less: what the step has left out is of second order, and within the noise
+# The ends have moved less: what the step has left out is of second order, and within the noise; and thinned points may
+# move by as much without being thinned anew, which takes as long as all the rest of a frame.
+SETTLED = 0.5 * FINE
 
 
 def without_motion(
@@ -30,14 +32,15 @@ def without_motion(
         ends = displacement(exp(twist), np.eye(4), scan.points)
         if not ends > LEFT * max(rms, LEAST_SIGMA):
             break
-        better = moving.with_twist(moving.twist + twist)
-        again = better.prepared()
+        settled = ends < SETTLED
+        better = moving.with_rest(twist) if settled else moving.with_twist(twist)
+        again = scan.deskewed(twist) if settled else better.prepared()
         if again is None:
             break
         found = local_map.fit(again, T_map_scan, (COARSE, FINE), fit.start, few=True)
         if found.total > fit.total:
             break
         scan, moving, fit = again, better, found
-        if ends < SETTLED:
+        if settled:
             break
     return scan, moving

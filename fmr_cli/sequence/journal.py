@@ -75,7 +75,7 @@ class Journal:
             raise FmrError(
                 f"{self.path}: was begun with other settings ({', '.join(changed)}), use those or leave out --resume"
             )
-        if "beginning" not in header:
+        if "beginning" not in header or any("within" not in line for line in lines):
             raise FmrError(f"{self.path}: was begun by another version of fmr, leave out --resume")
         return Beginning.from_json(header["beginning"]), lines
 

@@ -17,7 +17,7 @@ from fmr_cli.geometry.se3 import exp, log
 from fmr_cli.io import read_cloud
 from fmr_cli.sequence.deskew import scan_times, time_span
 from fmr_cli.sequence.journal import Beginning
-from fmr_cli.sequence.moving_scan import MovingScan
+from fmr_cli.sequence.moving_scan import MovingScan, Within
 from fmr_cli.sequence.prepared_scan import PreparedScan, prepare_scan
 from fmr_cli.sequence.readers import Readers
 from fmr_cli.sequence.scans import Scans
@@ -101,7 +101,7 @@ class Loader:
         self.scans, self.beginning, self.T_first_scan = scans, beginning, T_first_scan
         self.deskewed, self.strict, self.keep_clouds = beginning.deskewed, strict, keep_clouds
         self.reading = Reading(beginning.frame, keep_clouds, whole_way=not beginning.deskewed)
-        self.within: dict[int, np.ndarray] = {}  # T_begin_end by frame, (4, 4), file units, of those registered
+        self.within: dict[int, Within] = {}  # by frame, of those registered
         self.usual_sizes: deque[float] = deque(maxlen=SIZES_KEPT)
         self.spans: dict[int, tuple[float, float] | None] = {}  # see ``time_span``, by frame
 
@@ -158,10 +158,9 @@ class Loader:
             if self.strict:
                 raise
             return None
-        share, T_begin_end = self._share(index), self.within.get(index)
-        if T_begin_end is None:
-            T_begin_end = exp(share * log(self._motion_before(index)))
-        return MovingScan(cloud, times, T_begin_end, share, self.beginning.frame)
+        share = self._share(index)
+        within = self.within.get(index) or Within(exp(share * log(self._motion_before(index))))
+        return MovingScan(cloud, times, within, share, self.beginning.frame)
 
     def _motion_before(self, index: int) -> np.ndarray:
         """T_before_last (4, 4), file units, of the two frames before this one; in the first two, as the run began."""

@@ -31,6 +31,7 @@ from fmr_cli.sequence.journal import Beginning, Journal
 from fmr_cli.sequence.known_map import KnownMap
 from fmr_cli.sequence.loader import Loader
 from fmr_cli.sequence.loop_closure import close_loops
+from fmr_cli.sequence.moving_scan import Within
 from fmr_cli.sequence.odometry import Odometry
 from fmr_cli.sequence.options import SequenceOptions
 from fmr_cli.sequence.outputs import Outputs
@@ -99,10 +100,10 @@ def align_sequence(
                 undone = {"deskewed_by": "azimuth" if beginning.revolution else "times"} if moving else {}
                 rows.append(loaded.row | described(frame, poses) | undone | {"register_s": seconds})
                 if moving:
-                    loader.within[loaded.index] = moving.T_begin_end
+                    loader.within[loaded.index] = moving.within
                 state = {
                     "size": loaded.size, "T_map_scan": odometry.T_map_scan.tolist(),
-                    "T_begin_end": moving.T_begin_end.tolist() if moving else None, "state": odometry.state(),
+                    "within": moving.within.to_json() if moving else None, "state": odometry.state(),
                 }  # fmt: skip
                 files.add(rows[-1], poses[-1], moving.still() if moving and merged else loaded.cloud, state)
                 if on_row:
@@ -205,7 +206,7 @@ def go_on(
     T_map_scan = [np.array(line["T_map_scan"]) for line in done]
     rows.extend(line["row"] for line in done)
     poses.extend(odometry.frame.pose_to_file(T) for T in T_map_scan)
-    loader.within |= {i: np.array(line["T_begin_end"]) for i, line in enumerate(done) if line["T_begin_end"]}
+    loader.within |= {i: Within.from_json(line["within"]) for i, line in enumerate(done) if line["within"]}
     loader.usual_sizes.extend(line["size"] for line in done if line["size"])
     odometry.restore(done[-1]["state"], T_map_scan, loader.scan)
 

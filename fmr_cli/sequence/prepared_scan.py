@@ -13,7 +13,9 @@ import small_gicp
 from fmr_cli.cloud import PointCloud
 from fmr_cli.errors import RegistrationError
 from fmr_cli.geometry.normals import principal_variances, smallest_eigenvector
+from fmr_cli.geometry.se3 import exp
 from fmr_cli.geometry.voxels import voxel_downsample, voxel_means, voxel_ranks
+from fmr_cli.sequence.deskew import deskew
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 if TYPE_CHECKING:
@@ -96,6 +98,21 @@ class PreparedScan:
         wider = scatter(self.points, neighbours(tree, self.points[on_line], MANY_NEIGHBOURS))
         self.normals[on_line] = smallest_eigenvector(*wider)[0]
         self.solid[on_line] = ~lines(wider)
+
+    def deskewed(self, twist: np.ndarray) -> PreparedScan:
+        """The same once more motion (6,) within the scan is undone, scan axes: so little that thinning stays as it was.
+
+        ``whole`` is left as it is.
+        """
+        assert self.when is not None
+        still = object.__new__(PreparedScan)
+        still.whole, still.when, still.solid, still.tilt = self.whole, self.when, self.solid, self.tilt
+        still.ranges, still._neighbours, still._feature = self.ranges, self._neighbours, None
+        turn = twist * [1, 1, 1, 0, 0, 0]
+        still.points, still.normals = (
+            deskew(x, self.when, exp(motion)) for x, motion in ((self.points, twist), (self.normals, turn))
+        )
+        return still
 
     @cached_property
     def cloud(self) -> small_gicp.PointCloud:
