@@ -240,7 +240,7 @@ def suitable_voxel(points: np.ndarray) -> float:
     spread = np.linalg.norm(np.subtract(*np.percentile(points, [75, 25], axis=0)))
     if not spread > 0 or wanted < MIN_POINTS:
         raise RegistrationError("too few points, or all in one place")
-    voxel, centred = spread / 20, points - np.median(points, axis=0)
+    voxel, centred = float(spread) / 20, points - np.median(points, axis=0)
     for _ in range(STEPS):
         count = 1 + int(voxel_ranks(centred, voxel).max())
         if abs(count / wanted - 1) < COUNT_TOLERANCE:
