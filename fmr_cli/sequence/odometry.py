@@ -176,7 +176,7 @@ class Odometry:
         found, T_map_features = self._by_features(scan)
         by_features = self.map.fit(scan, T_map_features, (COARSE, FINE), "features")
         sure = found.status == "aligned"
-        if not (sure or self._fits(best) or self._fits(by_features)):
+        if not (sure or self._fits(best)):
             sure = self._borne_out(scan, T_map_features, by_features)
         if not sure:
             # A leap that nothing vouches for: a passage's corner fits another one in several ways.

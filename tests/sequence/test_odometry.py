@@ -140,6 +140,17 @@ def test_a_scan_across_a_gap_is_where_all_points_have_it_and_uncertain_where_the
         assert not sure or np.allclose(fit.T_map_scan, T_map_scan)
 
 
+def test_all_points_are_asked_where_no_start_fits_though_the_pose_by_features_does(at_a_gap, monkeypatch):
+    odometry, scan, T_map_scan, _ = at_a_gap
+    monkeypatch.setattr(odometry, "_by_features", lambda scan: (SimpleNamespace(status="uncertain"), T_map_scan))
+    fits = {"features": Fit(T_map_scan, 0.45, 1.0, "features")}  # hardly better than the others, so no leap by itself
+    monkeypatch.setattr(odometry.map, "fit", lambda scan, T, levels, name, **_: fits.get(name, Fit(T, 0.3, 1.0, name)))
+    monkeypatch.setattr(odometry, "_borne_out", lambda scan, T, fit: True)
+    fit = odometry._best_fit(scan, odometry.motion.expect(None, 1.0))
+    assert fit.verified
+    assert fit.start == "features"
+
+
 @pytest.mark.parametrize("observed", [True, False])
 def test_what_two_scans_across_a_gap_leave_open_the_map_has_to_determine(at_a_gap, monkeypatch, observed):
     odometry, scan, T_map_scan, fit = at_a_gap
