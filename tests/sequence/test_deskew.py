@@ -7,6 +7,7 @@ from itertools import islice
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.spatial import cKDTree
 
 from fmr_cli import PointCloud
 from fmr_cli.cloud import transform_points
@@ -17,6 +18,7 @@ from fmr_cli.sequence import align_sequence
 from fmr_cli.sequence.deskew import deskew, scan_times
 from fmr_cli.sequence.journal import Beginning
 from fmr_cli.sequence.loader import Loader
+from fmr_cli.sequence.prepared_scan import PreparedScan
 from fmr_cli.sequence.scans import as_scans
 from fmr_cli.sequence.voxel_frame import VoxelFrame
 from fmr_cli.synthetic.drives import Drive, Way, spinning, streets
@@ -74,6 +76,22 @@ def test_the_motion_within_a_scan_is_found_with_its_pose_where_the_way_shakes():
     # Half a second before, it turned otherwise by 20 deg/s: 2 deg over a scan, half of which would stay in the pose.
     assert np.median(degrees) < 0.15
     assert np.median(shift) < 0.03
+
+
+def test_a_little_more_motion_moves_thinned_points_as_thinning_anew_would():
+    rng = np.random.default_rng(0)
+    floor, wall = (
+        rng.uniform([-20, -20, 0], [20, 20, 0.05], (8000, 3)),
+        rng.uniform([-20, 8, 0], [20, 8.05, 9], (3000, 3)),
+    )
+    points, sensor, twist = np.concatenate([floor, wall]), np.array([0, 0, 3.0]), np.array([0, 0, 0.01, 0.2, 0.1, 0])
+    times = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)) % 1
+    moved = PreparedScan(points, sensor, times).deskewed(twist)
+    anew = PreparedScan(deskew(points, times, exp(twist)), sensor, times)
+    apart, which = cKDTree(anew.points).query(moved.points)
+    assert np.median(apart) < 0.1 * np.linalg.norm(twist[3:])
+    assert np.median(np.einsum("ij,ij->i", moved.normals, anew.normals[which])) > 0.999
+    assert np.linalg.norm(moved.normals, axis=1) == pytest.approx(np.ones(len(moved)))
 
 
 def test_a_motion_within_a_scan_goes_to_voxels_and_back():

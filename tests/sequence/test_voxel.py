@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fmr_cli.errors import RegistrationError
-from fmr_cli.sequence.prepared_scan import choose_voxel, suitable_voxel
+from fmr_cli.sequence.prepared_scan import PreparedScan, choose_voxel, suitable_voxel
 
 
 def floor(rng, count, noise, size=20.0):
@@ -51,3 +51,11 @@ def test_later_scans_count_and_those_that_cannot_be_used_do_not():
     assert choose_voxel(narrow, wish=100.0) < 1.3 * first
     with pytest.raises(RegistrationError, match="in one place"):
         choose_voxel(np.zeros((500, 3)), others=[wide])
+
+
+def test_what_lies_further_off_than_voxels_can_be_told_apart_is_no_measurement():
+    points = floor(np.random.default_rng(0), 500, 0.01)
+    astray = np.insert(points, 200, [[1e30, 0.0, 0.0], [0.0, -3e6, 0.0]], axis=0)
+    scan, same = PreparedScan(astray, np.zeros(3), np.linspace(0, 1, 502)), PreparedScan(points, np.zeros(3))
+    assert np.array_equal(scan.points, same.points)
+    assert len(scan.when) == len(scan)
