@@ -16,7 +16,7 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration.confidence import ALIGNED, Judge
+from fmr_cli.registration.confidence import Judge
 from fmr_cli.registration.looks import COARSE, DISPUTED, FINE, HOPELESS, Look, coarse_look, further, surest
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
@@ -98,6 +98,6 @@ def decisive(said: Mapping[Look, float]) -> tuple[Look, float]:
     best = max(coarse, key=lambda look: said[look], default=FINE)
     if said[best] < HOPELESS:
         return best, said[best]
-    if FINE in said and said[FINE] >= min(ALIGNED, said[best]):
+    if FINE in said and said[FINE] >= DISPUTED * said[best]:
         return FINE, said[FINE]
-    return best, min(said[best], DISPUTED)
+    return best, DISPUTED * said[best]

@@ -86,7 +86,7 @@ def test_the_first_look_that_is_sure_decides_and_a_wide_one_has_to_be_surer():
 def test_fine_voxels_alone_call_aligned_what_no_coarse_look_is_sure_of():
     said = {FIRST: 0.1, CLOSER: 0.9, WIDER: 0.5}
     assert decisive(said | {FINE: ALIGNED}) == (FINE, ALIGNED)
-    assert decisive(said | {FINE: 0.3}) == (CLOSER, DISPUTED)
-    assert decisive({FIRST: 0.1, FINE: 0.3}) == (FINE, 0.3)
+    assert decisive(said | {FINE: 0.5}) == (FINE, 0.5)
+    assert decisive(said | {FINE: 0.1}) == (CLOSER, DISPUTED * 0.9)
     assert decisive({FIRST: 0.01, FINE: 0.3}) == (FIRST, 0.01)  # hopeless
     assert decisive({FINE: 0.3}) == (FINE, 0.3)
