@@ -67,9 +67,6 @@ class PreparedScan:
 
     def __init__(self, points: np.ndarray, sensor: np.ndarray, times: np.ndarray | None = None) -> None:
         """points: (M, 3) before thinning; sensor: (3,); both in voxels. times: (M,), 0 to 1 over the scan."""
-        if max(points.max(), -points.min()) > FARTHEST:
-            near = (np.abs(points) <= FARTHEST).all(1)
-            points, times = points[near], None if times is None else times[near]
         self.whole = points.astype(np.float32)
         rank = voxel_ranks(points, 1.0)
         self.points = voxel_means(points, rank)
@@ -211,9 +208,13 @@ def prepare_scan(points: np.ndarray, frame: VoxelFrame, times: np.ndarray | None
 
     Safe in another thread.
     """
+    points = frame.points_to_voxels(points)
+    if max(points.max(initial=0.0), -points.min(initial=0.0)) > FARTHEST:
+        near = (np.abs(points) <= FARTHEST).all(1)
+        points, times = points[near], None if times is None else times[near]
     if len(points) < MIN_POINTS:
         return None
-    scan = PreparedScan(frame.points_to_voxels(points), frame.sensor, times)
+    scan = PreparedScan(points, frame.sensor, times)
     return scan if len(scan) >= MIN_POINTS else None
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fmr_cli.errors import RegistrationError
-from fmr_cli.sequence.prepared_scan import PreparedScan, choose_voxel, suitable_voxel
+from fmr_cli.sequence.prepared_scan import choose_voxel, prepare_scan, suitable_voxel
+from fmr_cli.sequence.voxel_frame import VoxelFrame
 
 
 def floor(rng, count, noise, size=20.0):
@@ -56,6 +57,8 @@ def test_later_scans_count_and_those_that_cannot_be_used_do_not():
 def test_what_lies_further_off_than_voxels_can_be_told_apart_is_no_measurement():
     points = floor(np.random.default_rng(0), 500, 0.01)
     astray = np.insert(points, 200, [[1e30, 0.0, 0.0], [0.0, -3e6, 0.0]], axis=0)
-    scan, same = PreparedScan(astray, np.zeros(3), np.linspace(0, 1, 502)), PreparedScan(points, np.zeros(3))
+    frame = VoxelFrame(1.0, np.zeros(3))
+    scan, same = prepare_scan(astray, frame, np.linspace(0, 1, 502)), prepare_scan(points, frame)
     assert np.array_equal(scan.points, same.points)
     assert len(scan.when) == len(scan)
+    assert prepare_scan(1e30 * points, frame) is None
