@@ -83,8 +83,8 @@ def disputed(coarse: Judge, fine: Judge) -> Judge:
     """The coarse look, with what DISPUTED leaves of its confidence; the best pose has what the fine look says of it."""
     best, *others = (replace(c, confidence=DISPUTED * c.confidence) for c in coarse.candidates)
     same = coarse.pair.same(best.T_target_source, fine.best.T_target_source)
-    elsewhere = "bear it out less" if same else f"fit better {in_words(coarse.pair, best, fine.best)}"
-    return replace(coarse, candidates=[replace(best, doubt=f"finer voxels {elsewhere}"), *others])
+    says = "less speaks for it" if same else f"the scans fit better {in_words(coarse.pair, best, fine.best)}"
+    return replace(coarse, candidates=[replace(best, doubt=f"on finer voxels {says}"), *others])
 
 
 def finer(judge: Judge) -> Judge:

@@ -34,7 +34,9 @@ def looked(scans: tuple[Prepared, Prepared], look: looks.Look, confidence: float
     return judge
 
 
-@pytest.mark.parametrize(("shift", "reason"), [(0.0, "bear it out less"), (1.0, "fit better shifted by 1 along")])
+@pytest.mark.parametrize(
+    ("shift", "reason"), [(0.0, "less speaks for it"), (1.0, "the scans fit better shifted by 1 along")]
+)
 def test_a_pose_that_fine_voxels_do_not_bear_out_is_given_with_a_doubt(
     scans: tuple[Prepared, Prepared], shift: float, reason: str
 ) -> None:
@@ -42,7 +44,7 @@ def test_a_pose_that_fine_voxels_do_not_bear_out_is_given_with_a_doubt(
     judge = looks.disputed(coarse, fine)
     assert judge.best.T_target_source.tolist() == coarse.best.T_target_source.tolist()
     assert judge.best.confidence == looks.DISPUTED * 0.94 < ALIGNED
-    assert doubts(judge.pair, judge.best, [])[0].startswith(f"finer voxels {reason}")
+    assert doubts(judge.pair, judge.best, [])[0].startswith(f"on finer voxels {reason}")
 
 
 def test_a_wide_look_is_refined_on_finer_voxels_and_others_on_their_own(scans: tuple[Prepared, Prepared]) -> None:
