@@ -185,13 +185,6 @@ def right(
     return bool(off < share * size and angle_degrees(np.linalg.inv(truth) @ T) < degrees)
 
 
-def bounds(hits: int, of: int) -> tuple[float, float]:
-    """95 % bounds of a share (Wilson)."""
-    z, p = 1.96, hits / of
-    middle, half = p + z * z / (2 * of), z * np.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
-    return (middle - half) / (1 + z * z / of), (middle + half) / (1 + z * z / of)
-
-
 def chosen(cases: list[Case], pairs: int, seed: int) -> list[Case]:
     """At most ``pairs`` of each band."""
     rng = np.random.default_rng(seed)
@@ -224,7 +217,7 @@ def summary(rows: list[dict]) -> dict[str, object]:
         hits = sum(r["right"] for r in rows)
         said |= {
             "right": hits,
-            "bounds": [round(float(x), 2) for x in bounds(hits, len(rows))],
+            "bounds": [round(x, 2) for x in plots.binomial(hits / len(rows), len(rows))],
             "aligned": sum(r["aligned"] for r in rows),
             "wrong": sum(r["aligned"] and not r["right"] for r in rows),
             "seconds": round(float(np.median([r["seconds"] for r in rows])), 2),
@@ -236,21 +229,19 @@ def summary(rows: list[dict]) -> dict[str, object]:
 
 def picture(path: Path, report: dict[str, dict[str, dict[str, Any]]], title: str) -> None:
     """The share that is right by each model, band by band, with its bounds; an image file by the path's suffix."""
-    with plots.figure(path, plots.COLUMN, 0.8 * plots.COLUMN) as figure:
+    series, bands = [], list(next(iter(report.values())))
+    for name, rows in report.items():
+        shares = [row["right"] / row["pairs"] for row in rows.values()]
+        low, high = zip(*(row["bounds"] for row in rows.values()), strict=True)
+        series.append(plots.Series(name, range(len(bands)), shares, low, high))
+    counts = [", ".join(str(rows[band]["right"]) for rows in report.values()) for band in bands]
+    pairs = [row["pairs"] for row in next(iter(report.values())).values()]
+    named = [f"{band}\n{count} of {of}" for band, count, of in zip(bands, counts, pairs, strict=True)]
+    with plots.figure(path, plots.COLUMN, 0.7 * plots.COLUMN) as figure:
         axes = figure.subplots()
-        pairs = {band: row["pairs"] for bands in report.values() for band, row in bands.items()}
-        named = [f"{band}\n{pairs.get(band, 0)} pairs" for band in BANDS]
-        for i, (name, bands) in enumerate(report.items()):
-            places = [list(BANDS).index(band) + 0.2 * (i - (len(report) - 1) / 2) for band in bands]
-            axes.vlines(places, *zip(*(row["bounds"] for row in bands.values()), strict=True), color=plots.COLORS[i])
-            shares = [row["right"] / row["pairs"] for row in bands.values()]
-            axes.plot(places, shares, "o", color=plots.COLORS[i], label=name)
-            for place, row in zip(places, bands.values(), strict=True):
-                axes.annotate(str(row["right"]), (place, row["bounds"][0]), (0, -9), textcoords="offset points",
-                              ha="center", color=plots.COLORS[i])  # fmt: skip
-        axes.set(title=title, xlabel="overlap", ylabel="share of pairs that is right", ylim=(0, 1.08),
-                 xticks=range(len(BANDS)), xticklabels=named, xlim=(-0.4, len(BANDS) - 0.3))  # fmt: skip
-        axes.legend(loc="lower right", frameon=False)
+        plots.dots(axes, named, series)
+        axes.set(title=title, xlim=(0, 1.02), xlabel="share of pairs that is right, 95 % interval")
+        plots.names_above(figure, list(report))
 
 
 def main() -> None:

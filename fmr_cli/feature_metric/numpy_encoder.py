@@ -108,23 +108,22 @@ class NumpyEncoder:
         return value + np.array([layers[-1][1] for layers in posed]), index
 
     def contenders(
-        self, points: np.ndarray, g: np.ndarray, floor: np.ndarray, run: Run
+        self, points: np.ndarray, posed: Layers, floor: np.ndarray, run: Run
     ) -> tuple[np.ndarray, np.ndarray]:
-        """F of the points (N, 3) float32 moved by g (4, 4), and the indices of those that reach ``floor`` (K,).
+        """F of the points (N, 3) float32 by ``posed`` layers, and the indices of those that reach ``floor`` (K,).
 
         One channel is enough; where the floor is F of some of the points, F depends on no others.
         """
-        layers = self.posed(g)
-        above, channels = (floor - layers[-1][1] - ROUNDING)[:, None], np.arange(len(floor))
+        above, channels = (floor - posed[-1][1] - ROUNDING)[:, None], np.arange(len(floor))
 
         def part(job: tuple[int, slice]) -> tuple[np.ndarray, np.ndarray]:
-            values = self.values(points[job[1]], layers)
+            values = self.values(points[job[1]], posed)
             best = values[channels, values.argmax(1)]  # three times as fast as max
             reached = np.greater_equal(values, above, out=self._own.reached[: values.size].reshape(values.shape))
             return best, np.logical_or.reduce(reached, 0)
 
         best, reached = zip(*run(part, jobs(1, len(points))), strict=True)
-        return np.max(best, 0) + layers[-1][1], np.concatenate(reached).nonzero()[0]
+        return np.max(best, 0) + posed[-1][1], np.concatenate(reached).nonzero()[0]
 
     def jacobian(self, points: np.ndarray, index: np.ndarray, g: np.ndarray | None = None) -> np.ndarray:
         """J of F(exp(-xi) P) at xi = 0, P the points (N, 3) moved by g (4, 4): index (K,) -> (K, 6) float32."""

@@ -107,7 +107,8 @@ class NumpySolver(NumpyEncoder):
         active, near, seen, missed = few(source), False, None, np.inf
         errors, iteration, end, size = [], 0, iterations, np.inf
         while True:
-            feature, critical = (x[0] for x in self.peaks(active, [self.posed(T) for T in g], run))
+            posed = self.posed(g[0])
+            feature, critical = (x[0] for x in self.peaks(active, [posed], run))
             finished = iteration >= end or size < STOP_STEP
             far = (
                 np.inf
@@ -116,11 +117,11 @@ class NumpySolver(NumpyEncoder):
             )
             close = finished or (near and size < CLOSE)
             if (close and far > allowed) or (not near and (size < NEAR or iteration >= iterations - LAST)):
-                whole, index = self.contenders(source, g[0], feature - MARGIN * close, run)
+                whole, index = self.contenders(source, posed, feature - MARGIN * close, run)
                 missed = float(np.mean(whole - feature))
                 active, feature, near, seen = source[index], whole, True, g if close else None
                 if robust:  # whose step needs to know the points behind the feature
-                    critical = self.peaks(active, [self.posed(T) for T in g], run)[1][0]
+                    critical = self.peaks(active, [posed], run)[1][0]
             elif finished:
                 missed = 0.0
             r = feature - template.feature

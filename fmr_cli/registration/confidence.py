@@ -29,14 +29,14 @@ MOST_STRETCH = 0.05  # a stretch beyond it is as bad
 AS_GOOD = 1.5  # times as close as a surface's own neighbours: beyond, points are the same, and no surer for it
 # What no other evidence outweighs, and the confidence that it leaves at most; by the looks at 1,400 made-up pairs, bent
 # ones too (`python -m benchmarks.calibrate` counts them). Such pairs are too few for the weights to say so themselves.
-OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: 2 of 3243 right poses had that
-DENIED = 0.1  # more contradicted than explained: none of 75 poses that stood first was right
-# More than a third as many points missing as explained (1 : e): 21 of 297 were right. Furniture that was moved,
+OTHER_SCALE, IN_OTHER_SCALE = 0.02, 0.1  # a stretch beyond it: 5 of 4123 right poses had that
+DENIED = 0.1  # more contradicted than explained: 1 of 94 poses that stood first was right
+# More than a third as many points missing as explained (1 : e): 16 of 352 were right. Furniture that was moved,
 # another scale, another place of the like.
 LACKING_MUCH, IF_LACKING = 1.0, 0.3
-# Less than a tenth of the smaller scan explained: 8 of 26 were right, and streets turned end to end fit so.
+# Less than a tenth of the smaller scan explained: 15 of 40 were right, and streets turned end to end fit so.
 SCANT, IF_SCANT = 0.1, 0.5
-# Fewer points of detail than that, hardly more than a corner, which fits any other: 14 of 234 were right.
+# Fewer points of detail than that, hardly more than a corner, which fits any other: 39 of 356 were right.
 BARE, IF_BARE = 5, 0.3
 # A rival that has ABOUT as much support and weighs NEARLY as much, where no thing stands out that one scan lacks (the
 # largest has less than STANDS_OUT times as many points as the pose's own): one of the like may stand first for being

@@ -7,13 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fmr_cli.cloud import PointCloud
 from fmr_cli.evaluation.verdict import calibration_error
-from fmr_cli.evaluation.verdict_evidence import Judged, decisive, pair_evidence
+from fmr_cli.evaluation.verdict_evidence import Judged, all_looks, decisive, pair_evidence
 from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
 from fmr_cli.registration.confidence import ALIGNED, DETAIL, MISSING, QUALITY, SHARE, STRETCH
-from fmr_cli.registration.looks import CLOSER, DISPUTED, FINE, FIRST, SURE, WIDER
+from fmr_cli.registration.looks import CLOSER, DISPUTED, FINE, FIRST, SURE, WIDER, at_once
+from fmr_cli.registration.options import Options
+from fmr_cli.registration.pipeline import one_blas_thread
+from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.result import Stopwatch
 from fmr_cli.report.calibration import calibration_table, plot_calibration
 from fmr_cli.synthetic.calibration_pairs import DRAWN
+from fmr_cli.synthetic.verdict_pairs import fresh_pair
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +96,13 @@ def test_fine_voxels_alone_call_aligned_what_no_coarse_look_is_sure_of():
     assert decisive(said | {FINE: 0.1}) == (CLOSER, DISPUTED * 0.9)
     assert decisive({FIRST: 0.01, FINE: 0.3}) == (FIRST, 0.01)  # hopeless
     assert decisive({FINE: 0.3}) == (FINE, 0.3)
+
+
+@pytest.mark.parametrize("kind", ["copy", "facade", "seats", "object, 10 to 30 %"])
+def test_what_the_looks_decide_is_what_align_says(kind):
+    pair = fresh_pair(kind, 42_000, 0)
+    with one_blas_thread():
+        source, target = Prepared(PointCloud(pair.source)), Prepared(PointCloud(pair.target))
+        said = {look: judge.best.confidence for look, judge in all_looks(source, target).items() if judge.candidates}
+        judge = at_once(source, target, Options(), 1, Stopwatch())
+    assert decisive(said)[1] == judge.best.confidence
