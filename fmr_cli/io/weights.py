@@ -1,8 +1,8 @@
 """All that a registration has learnt, in one file: safetensors, what is no tensor in its metadata. Without torch.
 
 ``encoder.*``: the encoder of whole clouds, its architecture in the metadata; ``decoder.*``: that of its training;
-``local.*``: the encoder of local patches; ``verdict`` (metadata, JSON): what ``models/verdict.json`` holds. A file may
-hold any of these; what it lacks is the bundled one's.
+``local.*``: the encoder of local patches; ``verdict`` (metadata, JSON): what ``models/verdict.json`` holds; ``site.*``:
+what training has seen of a site, as points. A file may hold any of these; what it lacks is the bundled one's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class Weights:
     """hidden: the widths of the global encoder's hidden layers; layers: the hidden ones and the last, K wide.
 
     Without a global encoder, layers is empty and feature_dim 0. decoder, local: arrays by name, empty where the file
-    holds none. verdict: the calibration, None where the file has none.
+    holds none. verdict: the calibration, None where the file has none. sites: points (N, 3) of each, near the origin,
+    in the scans' unit.
     """
 
     hidden: tuple[int, ...] = ()
@@ -34,6 +35,7 @@ class Weights:
     decoder: dict[str, np.ndarray] = field(default_factory=dict)
     local: dict[str, np.ndarray] = field(default_factory=dict)
     verdict: dict[str, Any] | None = None
+    sites: list[np.ndarray] = field(default_factory=list)
 
 
 def weights_bytes(weights: Weights) -> bytes:
@@ -42,6 +44,7 @@ def weights_bytes(weights: Weights) -> bytes:
 
     arrays = {f"decoder.{name}": array for name, array in weights.decoder.items()}
     arrays |= {f"local.{name}": array for name, array in weights.local.items()}
+    arrays |= {f"site.{number}": points.astype(np.float32) for number, points in enumerate(weights.sites)}
     for i, (W, b) in enumerate(weights.layers):
         arrays |= {f"encoder.layers.{i}.weight": W, f"encoder.layers.{i}.bias": b}
     metadata = {}
@@ -68,8 +71,10 @@ def read_weights(path: Path | str) -> Weights:
     try:
         local = part(arrays, "local.") or {name: array for name, array in arrays.items() if name.startswith(BARE)}
         verdict = json.loads(metadata["verdict"]) if "verdict" in metadata else None
+        named = part(arrays, "site.")
+        sites = [shaped(named, str(number), (len(named[str(number)]), 3)) for number in range(len(named))]
         if local and "architecture" not in metadata:
-            return Weights(local=local, verdict=verdict)
+            return Weights(local=local, verdict=verdict, sites=sites)
         architecture = json.loads(metadata["architecture"])
         hidden, feature_dim = tuple(int(w) for w in architecture["hidden"]), int(architecture["feature_dim"])
         layers = [
@@ -83,7 +88,7 @@ def read_weights(path: Path | str) -> Weights:
         raise ModelError(
             f"{path}: the weights do not fit the encoder ({reason}); use one written by `fmr train`"
         ) from None
-    return Weights(hidden, feature_dim, layers, part(arrays, "decoder."), local, verdict)
+    return Weights(hidden, feature_dim, layers, part(arrays, "decoder."), local, verdict, sites)
 
 
 def part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -12,11 +12,15 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from fmr_cli.cloud import PointCloud
 from fmr_cli.descriptors.patch_encoder import LocalEncoder
 from fmr_cli.errors import ModelError
 from fmr_cli.feature_metric.numpy_solver import NumpySolver
 from fmr_cli.feature_metric.search import Solver
 from fmr_cli.io.weights import Weights, read_weights
+from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.verdict_weights import Weights as VerdictWeights
 from fmr_cli.registration.verdict_weights import usable
 
@@ -69,6 +73,14 @@ class Model:
     def verdict(self) -> VerdictWeights:
         """The weights of the verdict's evidence: the file's own, or the bundled ones."""
         return usable(self.weights.verdict)
+
+    @cached_property
+    def sites(self) -> list[Prepared]:
+        """What the file keeps of sites, made ready to find scans there; the bundled one knows none."""
+        return [
+            Prepared(PointCloud(points.astype(np.float64), path=Path(f"{self.name}, site {number}")))
+            for number, points in enumerate(self.weights.sites, 1)
+        ]
 
     def on(self, device: Device) -> Encoder:
         """The encoder of whole clouds as torch has it."""

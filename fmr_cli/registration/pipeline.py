@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,10 @@ from threadpoolctl import ThreadpoolController
 
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration import hypotheses, mirror, places, refinement
+from fmr_cli.registration import hypotheses, mirror, places, refinement, sites
 from fmr_cli.registration.confidence import LIKELY, Candidate, Judge
 from fmr_cli.registration.looks import CLOSER, FIRST, SURE, at_once, coarse_look, likely
+from fmr_cli.registration.models import model
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.prepared import Prepared, check_systems
@@ -65,6 +66,8 @@ def align(
     check_systems(prepared, target)
     found = as_they_are(prepared, target, options, threads, check, time)
     aligned = found.status == "aligned"
+    if not aligned and (known := by_way_of_a_site(prepared, target, options, time)):
+        return replace(known, warnings=found.warnings, seconds=time.seconds)
     if aligned and mirror.unlikely(found):
         return found
     fits = None
@@ -81,6 +84,33 @@ def align(
     if fits and hints:
         found.warnings.append(mirror.HINT.format(fits.confidence))
     return found
+
+
+def by_way_of_a_site(source: Prepared, target: Prepared, options: Options, time: Stopwatch) -> Registration | None:
+    """The pose of two scans of a site that the model knows, if both are surely found there; see ``sites``."""
+    if not sites.asked(options):
+        return None
+    with one_blas_thread(), time.stage("site"):
+        source_there = sites.surest(on_sites(source, options))
+        target_there = sites.surest(on_sites(target, options)) if source_there else None
+        if not (source_there and target_there) or source_there.site is not target_there.site:
+            return None
+        return sites.composed(source, target, options, source_there, target_there)
+
+
+def on_sites(scan: Prepared, options: Options) -> list[sites.Placement]:
+    """Where a scan is found on each site that the model knows; sought once for all pairs that the scan is in."""
+    found = []
+    for site in model(options.model).sites:
+        found += scan.on_sites.get(site, partial(on_site, scan, site, options))
+    return found
+
+
+def on_site(scan: Prepared, site: Prepared, options: Options) -> list[sites.Placement]:
+    """Where a scan is found on a site; nowhere if it cannot be registered with that."""
+    with suppress(RegistrationError):  # too small beside the site, say
+        return [sites.Placement(site, as_they_are(scan, site, sites.there(options), 1, False, Stopwatch()))]
+    return []
 
 
 def mirror_look(

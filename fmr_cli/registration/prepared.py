@@ -90,6 +90,7 @@ class Prepared:
     def _forget(self) -> None:
         """What is computed from the points, for each kind of it: nothing yet."""
         self._surfaces, self._described, self._fine, self._gicp, self._roughness = (Memo(KEPT) for _ in range(5))
+        self.on_sites = Memo(KEPT)  # what is found of it there, by site
 
     @property
     def centre(self) -> np.ndarray:

@@ -114,9 +114,9 @@ def compare(
     """Registers the pairs by both models, kinds and bands in turn, as many as ``seconds`` allow (None: all)."""
     begin = time.monotonic()
     ordered, a, b = in_turn(pairs), model(before), model(after)
-    same = a.local.key == b.local.key and all(
+    same = a.local.key == b.local.key and not b.weights.sites and all(
         np.array_equal(x, y) for x, y in zip(a.whole.layers[-1], b.whole.layers[-1], strict=True)
-    )
+    )  # fmt: skip
 
     def one(item: tuple[int, CheckPair]) -> Checked | None:
         number, pair = item
@@ -182,7 +182,9 @@ def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
     if more_wrong(checked):
         why = why or "more wrong poses are called aligned than before"
     if why:
-        kept = model(start).weights
+        # What is seen of sites is no weight, and stays unless it may be what deceives.
+        sites = model(start).weights.sites if more_wrong(checked) else model(path).weights.sites
+        kept = replace(model(start).weights, sites=sites)
         return Decision(False, weights_bytes(kept), [f"not kept: {why}; {path} holds the start"])
     return Decision(True, replaced, said)
 

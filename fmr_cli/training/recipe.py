@@ -177,6 +177,7 @@ class ScanRecipe:
     held_out: float = 0.2  # share of the scans that are never trained on
     tested: int = 12  # held-out pairs whose matches are counted after each epoch
     checked: int = 48  # held-out pairs that are registered before and after, at most
+    site_points: int = 300_000  # that the model keeps of the sites it has seen, at most (12 bytes each); 0 keeps none
     whole: Recipe = field(default_factory=lambda: Recipe(crops=1024, decoder_warmup=100, held_out_pairs=12))
 
     def __post_init__(self) -> None:

@@ -22,6 +22,7 @@ from fmr_cli.training.recipe import ScanRecipe
 from fmr_cli.training.run_folder import TrainingError
 from fmr_cli.training.scan_views import Overlapping, drawn_views, made_up_pair, seen_twice, whole_views
 from fmr_cli.training.self_registration import BANDS, Found, Placed, drawn, register_scans, side_by_side
+from fmr_cli.training.sites import Part
 from fmr_cli.training.task import Files, Show
 
 ROUNDS = "registered.json"
@@ -178,6 +179,12 @@ class ScanMaterial:
             if parts is not None and len(found) < count:
                 found.append((list(BANDS)[which], parts))
         return found
+
+    def parts(self) -> list[Part]:
+        """The scans that stand in one frame by the last round, without those that are held out."""
+        found = self.rounds[-1].parts if self.rounds else []
+        parts = [{n: np.array(T) for n, T in part.items() if n not in self.held_out} for part in found]
+        return [part for part in parts if part]
 
     def held_out_pairs(self) -> list[Placed]:
         """The pairs with a scan that is held out."""

@@ -7,6 +7,8 @@ learns (InfoNCE). A share of the steps is the global encoder's, by the paper's l
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,12 +30,14 @@ from fmr_cli.training.run_folder import MODEL, held
 from fmr_cli.training.scan_material import MADE_UP, SCANS, SHARES, ScanMaterial
 from fmr_cli.training.scan_views import inlier_ratio, made_up_pair
 from fmr_cli.training.self_registration import Placed
+from fmr_cli.training.sites import Sites
 from fmr_cli.training.task import Files, Scores, Show, Task, ramped_cosine
 
 CURRENT = "current.safetensors"
 RIGHT = "right matches"  # column of metrics.csv: the share of the matches of two scans that are right
 FORGOTTEN = 0.15  # of the right matches on made-up scans, that may be lost
-CHECK_SHARE = 0.2  # of the minutes, that the last test may take
+CHECK_SHARE = 0.3  # of the minutes, that making sites and the last test may take
+SITES_SHARE = 0.5  # of these, that making sites may
 ROUNDS_SHARE = 0.3  # of the time that is left after the first round, that further ones may take
 RAMP = 30  # steps over which the rate rises: Adam knows its second moments by then, and a run may be short
 
@@ -151,17 +155,14 @@ class ScanTask(Task):
 
     def weights(self) -> bytes:
         """The model file: both encoders, the global one as it was where it has got worse."""
-        started = model(self.start).weights
-        local = self.learnt()
-        if self.whole is None or not self.whole_is_better():
-            return weights_bytes(Weights(**vars(started) | {"local": local, "decoder": started.decoder}))
-        encoder, decoder = self.whole.encoder, self.whole.decoder
-        return weights_bytes(
-            Weights(
-                encoder.hidden, encoder.feature_dim, encoder.arrays(),
-                arrays(decoder.state_dict()) if decoder is not None else {}, local, started.verdict,
-            )
-        )  # fmt: skip
+        weights = replace(model(self.start).weights, local=self.learnt())
+        if self.whole is not None and self.whole_is_better():
+            encoder, decoder = self.whole.encoder, self.whole.decoder
+            weights = replace(
+                weights, hidden=encoder.hidden, feature_dim=encoder.feature_dim, layers=encoder.arrays(),
+                decoder=arrays(decoder.state_dict()) if decoder is not None else {},
+            )  # fmt: skip
+        return weights_bytes(weights)
 
     def whole_is_better(self) -> bool:
         """Whether the global encoder is no worse than it was, on its own held-out crops."""
@@ -200,8 +201,12 @@ class ScanTask(Task):
 
     def check(self, files: Files, seconds: float | None, show: Show) -> dict[str, Any] | None:
         """Held-out pairs registered by ``align`` before and after; what has got worse is not kept."""
+        begin, said = time.monotonic(), []
+        if self.recipe.site_points:
+            said = self.keep_sites(files, None if seconds is None else SITES_SHARE * seconds, show)
         if not self.recipe.checked:
-            return None
+            return {"said": said, "rows": [], "kept": True} if said else None
+        seconds = None if seconds is None else seconds - (time.monotonic() - begin)
         third, material = self.recipe.checked // 3, self.material
         placed = material.held_out_pairs()
         pairs = check.of_scans(placed, material.store, self.recipe.checked - third, self.recipe.seed)
@@ -213,7 +218,21 @@ class ScanTask(Task):
         decision = check.decide(checked, files.path / MODEL, self.start)
         if decision.replaced is not None:
             files.write(MODEL, decision.replaced)
-        return {"said": decision.said, "rows": check.rows(checked), "kept": decision.kept}
+        return {"said": [*said, *decision.said], "rows": check.rows(checked), "kept": decision.kept}
+
+    def keep_sites(self, files: Files, seconds: float | None, show: Show) -> list[str]:
+        """Puts what was seen of sites into the model file, in so many seconds; says so."""
+        begin, path = time.monotonic(), files.path / MODEL
+        makes = Sites(
+            self.material.store, path, lambda: seconds is not None and time.monotonic() - begin > seconds, show
+        )
+        sites = makes.learn(self.material.parts())
+        if not sites:
+            return []
+        points = [makes.points(site, self.recipe.site_points // len(sites)) for site in sites]
+        files.write(MODEL, weights_bytes(replace(model(path).weights, sites=points)))
+        scans, several = sum(map(len, sites)), f"{len(sites)} sites" if len(sites) > 1 else "a site"
+        return [f"the model keeps {sum(map(len, points)):,} points of {several} that {scans} scans show"]
 
 
 def arrays(tensors: dict[str, Tensor]) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import FmrError
-from fmr_cli.geometry.frames import leave_frames
+from fmr_cli.geometry.frames import Frame, leave_frames
 from fmr_cli.multiway.candidates import look_at_pairs
 from fmr_cli.multiway.claims import AGREE
 from fmr_cli.multiway.known import Known
@@ -71,12 +71,16 @@ class Placed:
 
 @dataclass
 class Found:
-    """What registering some of the scans has given. said: in words; skipped: files that could not be read."""
+    """What registering some of the scans has given. said: in words; skipped: files that could not be read.
+
+    parts: the scans that stand in one frame, by number: T_part_scan (4, 4), files' coordinates.
+    """
 
     pairs: list[Placed]
     scans: list[int]
     said: str
     skipped: list[str]
+    parts: list[dict[int, list[list[float]]]] = field(default_factory=list)
 
     def joined(self) -> bool:
         """Whether the pairs join all the scans into one part: there is no other place for any of them."""
@@ -91,7 +95,8 @@ class Found:
 
     @classmethod
     def of(cls, plain: dict[str, Any]) -> Found:
-        return cls(**plain | {"pairs": [Placed(**pair) for pair in plain["pairs"]]})
+        parts = [{int(n): T for n, T in part.items()} for part in plain.get("parts", [])]
+        return cls(**plain | {"pairs": [Placed(**pair) for pair in plain["pairs"]], "parts": parts})
 
 
 def band(overlap: float) -> str:
@@ -131,7 +136,11 @@ def register_scans(
         placed = [p for p in survey.each("placing", lambda c: settled(survey, *c), chosen) if p is not None]
     pairs = [Placed(**vars(p) | {"source": numbers[p.source], "target": numbers[p.target]}) for p in placed]
     skipped = [f"{scans[numbers[n]].source}: {survey.messages[n]}" for n in sorted(survey.failed)]
-    return Found(pairs, sorted(numbers[n] for n in survey.edges), in_words(survey, pairs), skipped)
+    parts = [
+        {numbers[n]: leave_frames(T, survey.frames[n], Frame()).tolist() for n, T in c.T_component_scan.items()}
+        for c in survey.components
+    ]
+    return Found(pairs, sorted(numbers[n] for n in survey.edges), in_words(survey, pairs), skipped, parts)
 
 
 def overlapping(survey: Survey) -> list[tuple[int, int, np.ndarray, float]]:

@@ -1,0 +1,85 @@
+"""Two scans of a site that the model knows: each is found there by itself, so that they need not overlap.
+
+What `fmr train` has seen of a site is kept in its model, thinned. With T_site_scan of both scans,
+T_target_source = T_site_target⁻¹ T_site_source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fmr_cli.geometry.frames import enter_frames
+from fmr_cli.geometry.se3 import adjoint
+from fmr_cli.registration.confidence import Judge, among
+from fmr_cli.registration.looks import FINE, SURE
+from fmr_cli.registration.options import Options
+from fmr_cli.registration.pair import make_pair
+from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.result import Registration, describe
+
+START = "site"  # of poses that come from there
+
+
+def asked(options: Options) -> bool:
+    """Whether a pose may come by way of a site: one that is rigid, of two scans of one unit, from no given start."""
+    alike = options.dof == "rigid" and not options.scale and options.unit is None
+    return alike and isinstance(options.init, str) and options.init == "auto"
+
+
+def there(options: Options) -> Options:
+    """The options by which one scan is found on a site: what bounds the pose of the two bounds no other."""
+    return replace(options, voxel_size=None, max_angle=None, max_shift=None, allow_mirror=False)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A scan on a site: the ``Registration`` of the scan with the site as its target."""
+
+    site: Prepared
+    found: Registration
+
+
+def surest(placements: Sequence[Placement]) -> Placement | None:
+    """The one of a scan's placements, each on another site, that is surely right; None if there is none.
+
+    It has what the others leave of its confidence, as a scan is on one site at most. Two placements make a pose: each
+    has to be surer than a pose is to be ``aligned``.
+    """
+    if not placements:
+        return None
+    best, *others = sorted(placements, key=lambda placement: -placement.found.confidence)
+    confidence = among(best.found.confidence, [other.found.confidence for other in others])
+    sure = best.found.status == "aligned" and confidence >= SURE
+    return replace(best, found=replace(best.found, confidence=confidence)) if sure else None
+
+
+def composed(
+    source: Prepared, target: Prepared, options: Options, source_there: Placement, target_there: Placement
+) -> Registration | None:
+    """The pose of two scans that are on one site, and what their surfaces say of it; None if not allowed.
+
+    The covariance is that of both placements, which are independent; what the site itself is off between the two places
+    is not in it.
+    """
+    there, T_target_site = source_there.found, np.linalg.inv(target_there.found.T_target_source)
+    pair = make_pair(source, target, options, 1, *FINE)
+    T_target_source = pair.enter_centred(T_target_site @ there.T_target_source)
+    if not pair.allowed(T_target_source):
+        return None
+    judge = Judge(pair)
+    judge.consider(T_target_source, START, [])
+    confidence = there.confidence * target_there.found.confidence
+    found = describe(pair, replace(judge.best, confidence=confidence), [], source, 1.0, options)
+    A = adjoint(enter_frames(T_target_site, target_there.site.frame, target.frame))
+    covariance = A @ (there.covariance + target_there.found.covariance) @ A.T
+    return replace(
+        found,
+        status="aligned",
+        covariance=covariance,
+        information=np.linalg.pinv(covariance, rcond=1e-12, hermitian=True),
+        undetermined=[],
+        reasons=[],
+    )
