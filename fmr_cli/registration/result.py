@@ -40,7 +40,8 @@ class Registration:
     feature_check: where asked for, "errors" as above of a few iterations from T, and by how far they move it: "angle"
         in degrees and "shift" of the source's centre, own unit. What only one scan saw pulls at a global feature, so at
         part overlap they do move it.
-    start: which start the pose came from ("identity", "centroid", "search", "features", "given").
+    start: which start the pose came from ("identity", "centroid", "search", "features", "given"); "site" where both
+        scans were found on a site that the model knows.
     angle: rotation angle of T, degrees. shift: how far T moves the source's centre, own unit.
     information: (6, 6) of a twist (rotation, translation) in the target's frame about ``origin`` (3,), the target's
         mean; rad⁻² and unit⁻². covariance: its inverse over the directions that are determined.

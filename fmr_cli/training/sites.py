@@ -54,8 +54,8 @@ class Sites:
         """The scans of each site that is worth keeping, largest first, of parts that scans have been joined to."""
         sites, rest = list[Part](), list[Part]()
         for part in parts:
-            stay, _ = self.by_the_others(part) if len(part) >= FEWEST else ({}, [])
-            if len(stay) >= FEWEST:
+            stay = self.confirmed(part)
+            if stay:
                 sites.append(stay)
             left = {n: T for n, T in part.items() if n not in stay}
             rest += [left] if len(part) < FEWEST else [{n: T} for n, T in left.items()]
@@ -71,8 +71,20 @@ class Sites:
                 kept.append({n: T for n, T in site.items() if n not in elsewhere})
         return sorted(kept, key=len, reverse=True)
 
-    def by_the_others(self, part: Part) -> tuple[Part, list[int]]:
-        """The scans of a part that are found where they stand by all others, and those found elsewhere."""
+    def confirmed(self, part: Part) -> Part:
+        """The scans of a part that stand where all others say, if they are enough; none otherwise.
+
+        Where one is found elsewhere it moves, and all are sought again: what stands wrong hides where others belong.
+        """
+        if len(part) < FEWEST:
+            return {}
+        stay, elsewhere = self.by_the_others(part)
+        if elsewhere:
+            stay, _ = self.by_the_others(part | elsewhere)
+        return stay if len(stay) >= FEWEST else {}
+
+    def by_the_others(self, part: Part) -> tuple[Part, Part]:
+        """The scans of a part that are found where they stand by all others; those found elsewhere, and where."""
         numbers = sorted(part)
 
         def found(number: int) -> np.ndarray | None:
@@ -82,7 +94,7 @@ class Sites:
         again = side_by_side(found, numbers, partial(self.show, "sites: each scan by the others"))
         there = {n: T for n, T in zip(numbers, again, strict=True) if T is not None}
         stay = {n: part[n] for n, T in there.items() if self.same(n, T, part[n])}
-        return stay, [n for n in there if n not in stay]
+        return stay, {n: T for n, T in there.items() if n not in stay}
 
     def grown(self, sites: list[Part], rest: list[Part]) -> tuple[list[Part], list[Part]]:
         """Each site, largest first, with smaller ones and parts that are found on it as a whole; the other parts."""
