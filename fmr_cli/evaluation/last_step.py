@@ -65,7 +65,9 @@ Step = Callable[[Pair, np.ndarray], np.ndarray]  # a pose between the centred fr
 def by_gicp(pair: Pair, T: np.ndarray) -> np.ndarray:
     """GICP by small_gicp, whatever the noise."""
     target = pair.target.for_gicp(refinement.GICP_TARGET, pair.edge, 1)
-    return refinement.gicp_in_reach(pair, pair.source.fine(refinement.GICP_SOURCE, pair.edge), target, T)
+    return refinement.gicp_in_reach(
+        pair, pair.source.fine(refinement.GICP_SOURCE, pair.edge), target, T
+    ).T_target_source
 
 
 def by_point_to_plane(pair: Pair, T: np.ndarray) -> np.ndarray:
@@ -87,7 +89,7 @@ def by_patches_both(pair: Pair, T: np.ndarray) -> np.ndarray:
 
 def by_default(pair: Pair, T: np.ndarray) -> np.ndarray:
     """What `fmr align` does from a likely pose: point-to-plane from far to near, then the step that suits the noise."""
-    return refinement.exact(pair, refinement.by_geometry(pair, refinement.by_planes(pair, T)))
+    return refinement.exact(pair, refinement.by_geometry(pair, refinement.by_planes(pair, T))).T_target_source
 
 
 def patches_then_gicp(pair: Pair, T: np.ndarray) -> np.ndarray:

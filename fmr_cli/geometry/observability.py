@@ -26,12 +26,28 @@ HARDLY = 5e-3
 OPPOSED, SURELY = 5.0, 3.0
 REACH = 1.5  # voxel edges: correspondences further apart are no observations
 BLOCK = 8.0  # voxel edges: residuals within a block are taken to be correlated, those of two blocks not
+ROUNDING = 1e-6  # voxel edges: copies fit to it, and their pose is known no better
 BENDS = 8.0  # independent parts of a scan that is bent or drifted as a whole: half an extent each
 # Counted as left of a direction without a block: without the one block that alone holds it, nothing would be.
 LEFT = 1e-3
 BIAS = 1.0  # points' sigmas: of a range bias, beforehand; sensors' data sheets give accuracy and noise of one size
 EXPECTED = 6.0  # of the squared distance between a pose and another estimate of it, in deviations: one a direction
 LEAST_BLOCKS = 8  # fewer say nothing about the scatter of their sums
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What a pose is held by: points of the source, where it puts them, drawn onto planes through points of the target.
+
+    x, y: the points, normal: of the planes, unit; (N, 3) in the target's frame. weight: w of a residual r = n·(x - y),
+    at most 1; slope: of its pull w r by r; (N,).
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    normal: np.ndarray
+    weight: np.ndarray
+    slope: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -53,29 +69,32 @@ def certainty(
     origin: np.ndarray,
     noise: Sequence[float] = (0.0, 0.0),
     eyes: Sequence[np.ndarray | None] = (None, None),
+    polish: Observations | None = None,
 ) -> Certainty:
-    """Of the twist in the target's frame about ``origin`` (3,), by point-to-plane at a pose, both ways.
+    """Of the twist in the target's frame about ``origin`` (3,), by point-to-plane at a pose.
 
     noise: the deviation of single points of source and target from their surface, own unit. eyes: (3,) where their
     sensors were, each in its own frame, None where that isn't known: the middle of the points then, as a scanner that
-    looks all round has it.
-
-    The covariance is that of a robust estimate of correlated observations (Huber's sandwich, by blocks: Liang and Zeger
-    1986). With the pull ψ = w r of a residual and its slope ψ' by r, D = Σ ψ' J Jᵀ and g_b = Σ ψ J over block b of
-    neighbouring voxels, it is D⁻¹ (Σ g_b g_bᵀ) D⁻¹, however the residuals within a block hang together, be it by noise
-    that voxels share or by a surface that is bent. Each g_b is divided by the root of what the block itself leaves of
-    its square (I - D_b D⁻¹), since the pose follows a block that alone holds a direction: without bias where the
-    residuals are of one size (Bell and McCaffrey 2002), while the jackknife, without the root, has 1.1 times the
-    variance on made-up scans. Where the residuals' own optimum lies further from the pose than this covariance allows,
-    the step to it counts as a deviation along its own direction, and the others are none the worse for it. A misfit
-    beyond the surfaces' own roughness, as of scans that are bent or drifted, is the same over large parts, of which
-    there are BENDS.
+    looks all round has it. polish: what the pose was found by last, if by anything finer than the voxels: its error is
+    that of these residuals.
     """
-    seen, misfits = [], []
+    seen, misfit = voxels(source, target, T_target_source)
+    if not len(seen.x):
+        return Certainty(np.zeros((6, 6)), np.zeros((6, 6)))
+    r, J = linearise(seen.x, seen.y, seen.normal, origin)
+    information = normal_equations(J, r, seen.weight)[0] / 2 / variance_of(r, seen.weight, target.edge)
     source_eye, target_eye = (
         cloud.points.mean(0) if eye is None else eye for cloud, eye in zip((source, target), eyes, strict=True)
     )
     source_eye = transform_points(T_target_source, source_eye[None])[0]
+    by = seen if polish is None or not len(polish.x) else polish
+    outward = np.stack([outwards(by.x, by.normal, source_eye), -outwards(by.y, by.normal, target_eye)])
+    return Certainty(information, covariance(by, origin, target.edge, misfit, outward, np.asarray(noise)))
+
+
+def voxels(source: Surface, target: Surface, T_target_source: np.ndarray) -> tuple[Observations, float]:
+    """What the voxels observe at a pose, both ways, and the mean square of their misfit beyond their own roughness."""
+    seen, misfits = [], [0.0]
     placed = transform_points(T_target_source, source.points)
     for i, j, onto_target in partners(source, target, T_target_source):
         if not len(i):
@@ -83,28 +102,51 @@ def certainty(
         x, y = placed[i], target.points[j]
         n = target.normals[j] if onto_target else source.normals[i] @ T_target_source[:3, :3].T
         own = target.unevenness[0][j] if onto_target else source.unevenness[0][i]
-        r, J = linearise(x, y, n, origin)
+        r = np.einsum("ni,ni->n", n, x - y)
         scale2 = (SCALE * np.median(np.abs(r))) ** 2 + (1e-9 * target.edge) ** 2
-        outward = np.stack([outwards(x, n, source_eye), -outwards(y, n, target_eye)])
-        seen.append(np.vstack([r, geman_mcclure(r * r, scale2), geman_mcclure_slope(r * r, scale2), J, y.T, outward]))
+        seen.append(np.column_stack([x, y, n, geman_mcclure(r * r, scale2), geman_mcclure_slope(r * r, scale2)]))
         misfits.append(NORMAL**2 * (np.median(np.abs(r)) ** 2 - np.median(own) ** 2))
-    if not seen:
-        return Certainty(np.zeros((6, 6)), np.zeros((6, 6)))
-    r, w, slope, *rows = np.hstack(seen)
-    J, y, outward = np.stack(rows[:6]), np.stack(rows[6:9], 1), np.stack(rows[9:])
-    A = normal_equations(J, r, w)[0]
-    variance = max(float(w @ (r * r) / max(w.sum(), 1e-12)), (1e-6 * target.edge) ** 2)
+    x, y, n, both = np.split(np.vstack(seen) if seen else np.zeros((0, 11)), (3, 6, 9), axis=1)
+    return Observations(x, y, n, *both.T), max(sum(misfits), 0.0) / 2
+
+
+def variance_of(r: np.ndarray, weight: np.ndarray, edge: float) -> float:
+    """Of weighted residuals (N,), own unit squared."""
+    return max(float(weight @ (r * r) / max(weight.sum(), 1e-12)), (ROUNDING * edge) ** 2)
+
+
+def covariance(
+    seen: Observations, origin: np.ndarray, edge: float, misfit: float, outward: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """Of a pose (6, 6) that is held by these observations; origin and noise as for ``certainty``.
+
+    edge: of the voxels; misfit: as ``voxels`` give it; outward (2, N): as for ``range_bias``.
+
+    It is that of a robust estimate of correlated observations (Huber's sandwich, by blocks: Liang and Zeger 1986). With
+    the pull ψ = w r of a residual and its slope ψ' by r, D = Σ ψ' J Jᵀ and g_b = Σ ψ J over block b of neighbouring
+    points, it is D⁻¹ (Σ g_b g_bᵀ) D⁻¹, however the residuals within a block hang together, be it by noise that points
+    share or by a surface that is bent. Each g_b is divided by the root of what the block itself leaves of its square
+    (I - D_b D⁻¹), since the pose follows a block that alone holds a direction: without bias where the residuals are of
+    one size (Bell and McCaffrey 2002), while the jackknife, without the root, has 1.1 times the variance on made-up
+    scans. Where the residuals' own optimum lies further from the pose than this covariance allows, the step to it
+    counts as a deviation along its own direction, and the others are none the worse for it. A misfit beyond the
+    surfaces' own roughness, as of scans that are bent or drifted, is the same over large parts, of which there are
+    BENDS.
+    """
+    r, J = linearise(seen.x, seen.y, seen.normal, origin)
+    A, w = normal_equations(J, r, seen.weight)[0], seen.weight
+    variance = variance_of(r, w, edge)
     units = np.sqrt(np.maximum(np.diag(A), 1e-300))  # radians and lengths compare once each is divided by its own
     J = J / units[:, None]
     inverse = pseudo_inverse(A / np.outer(units, units))
-    covariance = inverse * w.sum() * max(sum(misfits), 0.0) / 2 / BENDS
-    block, index = np.unique(voxel_keys(y, BLOCK * target.edge), return_inverse=True)
-    covariance += range_bias(J, outward, w, r, inverse, variance, BIAS * np.asarray(noise), len(r) / len(block))
+    block, index = np.unique(voxel_keys(seen.y, BLOCK * edge), return_inverse=True)
+    found = inverse * w.sum() * (misfit / BENDS + (ROUNDING * edge) ** 2)
+    found += range_bias(J, outward, w, r, inverse, variance, BIAS * noise, len(r) / len(block))
     if len(block) >= LEAST_BLOCKS:
-        covariance += sandwich(J, w * r, slope, index)
+        found += sandwich(J, w * r, seen.slope, index)
     else:
-        covariance += inverse * variance
-    return Certainty(A / 2 / variance, covariance / np.outer(units, units))
+        found += inverse * variance
+    return found / np.outer(units, units)
 
 
 def partners(
@@ -155,7 +197,7 @@ def range_bias(
 
 
 def sandwich(J: np.ndarray, pull: np.ndarray, slope: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """The covariance (6, 6) of a robust estimate; see ``certainty``. J (6, N); the others (N,), block from 0 up."""
+    """The covariance (6, 6) of a robust estimate; see ``covariance``. J (6, N); the others (N,), block from 0 up."""
     count = int(block.max()) + 1
     pairs = np.stack([a * b * slope for a in J for b in J])
     D_b = np.stack([np.bincount(block, row, count) for row in pairs], 1).reshape(count, 6, 6)

@@ -150,12 +150,13 @@ def as_they_are(
                 break
         factor, judge = max(verdicts, key=lambda verdict: verdict[1].best.confidence)
         best = judge.best
+        polished = refinement.Polished(best.T_target_source)
         if options.refine:
             with time.stage("polish"):
-                T = refinement.by_geometry(judge.pair, best.T_target_source)
-                best = replace(best, T_target_source=refinement.exact(judge.pair, T))
+                polished = refinement.exact(judge.pair, refinement.by_geometry(judge.pair, best.T_target_source))
+                best = replace(best, T_target_source=polished.T_target_source)
         with time.stage("verdict"):
-            found = describe(judge.pair, best, judge.candidates[1:], source, factor, options)
+            found = describe(judge.pair, best, judge.candidates[1:], source, factor, options, polished.observed())
         if check:
             with time.stage("check"):
                 found.feature_check = feature_check(judge.pair, best.T_target_source)

@@ -6,7 +6,7 @@ Poses are between the centred frames of a ``Pair``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.inverse_compositional import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
-from fmr_cli.geometry.gicp import GicpCloud, gicp
+from fmr_cli.geometry.gicp import GicpCloud, gicp, observed
+from fmr_cli.geometry.observability import Observations
 from fmr_cli.geometry.planar import within_plane
 from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_plane, step_motion, with_scale
 from fmr_cli.geometry.sampling import sample
@@ -43,6 +44,19 @@ GICP_REACH = 3.0  # voxel edges: source points further from the target slow its 
 EXACT_TARGET = 200_000  # points of the target that the winner is refined against once more, each its own
 FINER = 4.0  # times the grid of the last step on large clouds, where they are dense enough
 COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
+
+
+@dataclass(frozen=True)
+class Polished:
+    """A pose; and, where GICP was the last to move it, the two clouds it went by, on voxels of ``edge``."""
+
+    T_target_source: np.ndarray
+    clouds: tuple[GicpCloud, GicpCloud] | None = None
+    edge: float = 0.0
+
+    def observed(self) -> Observations | None:
+        """What GICP went by. Of other steps the voxels say it: smoothing takes the noise out of the residuals too."""
+        return None if self.clouds is None else observed(*self.clouds, self.T_target_source, self.edge)
 
 
 def roughly(pair: Pair, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -151,14 +165,15 @@ def common_points(pair: Pair, T_target_source: np.ndarray) -> tuple[np.ndarray, 
     return found[..., :3], found[..., 3:]
 
 
-def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+def by_geometry(pair: Pair, T_target_source: np.ndarray) -> Polished:
     """The pose after GICP, or after point-to-plane within the options' motions and scale."""
     edge = pair.edge
     s, t = pair.both(lambda cloud, count: cloud.fine(count, edge), (GICP_SOURCE, GICP_TARGET))
     if pair.options.scale or pair.motion.dof != "rigid":
-        return constrained(s, t, T_target_source, edge, pair.motion.basis(), pair.options.scale)
-    T = gicp_in_reach(pair, s, pair.target.for_gicp(GICP_TARGET, edge, pair.threads), T_target_source)
+        return Polished(constrained(s, t, T_target_source, edge, pair.motion.basis(), pair.options.scale))
+    found = gicp_in_reach(pair, s, pair.target.for_gicp(GICP_TARGET, edge, pair.threads), T_target_source)
     if noisy(pair):
+        T = found.T_target_source
         any_motion = np.eye(6)
         clean_source, clean_target = (cloud.share < CLEAN for cloud in roughnesses(pair))
         if clean_target:  # onto a clean scan's own planes, which smoothing would bend
@@ -167,8 +182,9 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
             T = np.linalg.inv(constrained(t, s, np.linalg.inv(T), edge, any_motion, False))
         else:
             T = by_smoothed(pair, T, s, t)
+        found = Polished(T)
     planes = pair.flat_planes
-    return T if planes is None else within_plane(T, *planes)
+    return found if planes is None else Polished(within_plane(found.T_target_source, *planes))
 
 
 def noisy(pair: Pair) -> bool:
@@ -203,7 +219,7 @@ def by_smoothed(pair: Pair, T_target_source: np.ndarray, source: np.ndarray, tar
     return T
 
 
-def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_source: np.ndarray) -> np.ndarray:
+def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_source: np.ndarray) -> Polished:
     """GICP of those of the source's points that are in reach of the target and face along with it."""
     moved, t = transform_points(T_target_source, source), pair.t
     distance, beside = t.tree.query(moved, distance_upper_bound=GICP_REACH * pair.edge, workers=pair.threads)
@@ -211,29 +227,34 @@ def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_so
     normals = pair.s.normals[pair.s.tree.query(source[near], workers=pair.threads)[1]] @ T_target_source[:3, :3].T
     near = source[near[face_along(normals, t.normals[beside[near]])]]
     if len(near) < MIN_POINTS:
-        return T_target_source
-    return gicp(GicpCloud(near, pair.edge, pair.threads), target, T_target_source, pair.edge)
+        return Polished(T_target_source)
+    return by_gicp(GicpCloud(near, pair.edge, pair.threads), target, T_target_source, pair.edge)
 
 
-def exact(pair: Pair, T_target_source: np.ndarray) -> np.ndarray:
+def by_gicp(source: GicpCloud, target: GicpCloud, T_target_source: np.ndarray, edge: float) -> Polished:
+    """The pose after GICP between two clouds on voxels of ``edge``."""
+    return Polished(gicp(source, target, T_target_source, edge), (source, target), edge)
+
+
+def exact(pair: Pair, polished: Polished) -> Polished:
     """The pose after GICP on more than the step before saw, where there is more.
 
     Scans that have points in common come to coincide, point by point; otherwise a grid is the better mean, of large
     scans a finer one.
     """
-    source, target, T = pair.source, pair.target, T_target_source
+    source, target, T = pair.source, pair.target, polished.T_target_source
     other_motion = pair.options.scale or pair.motion.dof != "rigid"
     if other_motion or len(target.points) <= GICP_TARGET or pair.flat_planes is not None or noisy(pair):
-        return T  # what the step before did for these, GICP would undo
+        return polished  # what the step before did for these, GICP would undo
     if len(target.points) <= 4 * EXACT_TARGET and in_common(pair, T):
         some = sample(source.points, GICP_SOURCE, np.random.default_rng(pair.seed))
         return gicp_in_reach(pair, some, target.for_gicp(EXACT_TARGET, pair.edge, pair.threads, own=True), T)
     fine = max(pair.edge / FINER, SPACINGS * source.spacing, SPACINGS * target.spacing)
     if min(len(source.points), len(target.points)) < EXACT_TARGET or fine > pair.edge / 2:
-        return T
+        return polished
     s, t = pair.both(lambda cloud: voxel_downsample(cloud.points, fine))
     some = sample(s, GICP_SOURCE, np.random.default_rng(pair.seed))
-    return gicp(GicpCloud(some, fine, pair.threads), GicpCloud(t, fine, pair.threads), T, fine)
+    return by_gicp(GicpCloud(some, fine, pair.threads), GicpCloud(t, fine, pair.threads), T, fine)
 
 
 def in_common(pair: Pair, T_target_source: np.ndarray) -> bool:

@@ -89,17 +89,23 @@ class Registration:
 
 
 def describe(
-    pair: Pair, best: Candidate, others: list[Candidate], source: Prepared, factor: float, options: Options
+    pair: Pair,
+    best: Candidate,
+    others: list[Candidate],
+    source: Prepared,
+    factor: float,
+    options: Options,
+    polish: observability.Observations | None = None,
 ) -> Registration:
     """The best candidate in the files' coordinates, with its covariance and alternatives.
 
-    source: as it came; pair.source is that, every length multiplied by ``factor``.
+    source: as it came; pair.source is that, every length multiplied by ``factor``. polish: see ``certainty``.
     """
     T = pair.leave_centred(best.T_target_source)
     T[:3, :3] *= factor
     noise = [cloud.noise for cloud in roughnesses(pair)]
     eyes = (pair.source.eye, pair.target.eye)
-    certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3), noise, eyes)
+    certain = observability.certainty(pair.s, pair.t, best.T_target_source, np.zeros(3), noise, eyes, polish)
     rivals = [c for c in others if c.support >= LIKELY and c.weight >= RIVALLING * best.weight]
     points = smaller(pair, best.T_target_source)
     centre = points.mean(0)

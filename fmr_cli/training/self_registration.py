@@ -187,7 +187,7 @@ def settled(survey: Survey, source: int, target: int, T: np.ndarray, overlap: fl
     near = [pose for pose in own if float(displacement(pose, T, moment)) < 2 * reach]
     pose = near[0] if near else T
     if not near and overlap >= BANDS["part"][0]:
-        refined = by_geometry(pair, by_planes(pair, T))
+        refined = by_geometry(pair, by_planes(pair, T)).T_target_source
         pose = refined if float(displacement(refined, T, moment)) < reach else T
     fit = agreement(pair.s, pair.t, pose)
     if fit.contradicted > fit.explained or (not near and fit.missing > LACKING * fit.explained):
