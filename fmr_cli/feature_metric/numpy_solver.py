@@ -13,24 +13,20 @@ import itertools
 import numpy as np
 
 from fmr_cli.feature_metric.inverse_compositional import STOP_STEP, Solution, Template, iterate, make_template, step
-from fmr_cli.feature_metric.numpy_encoder import NumpyEncoder, Run, spread
+from fmr_cli.feature_metric.numpy_encoder import FEW, NumpyEncoder, Run, spaced, spread
+from fmr_cli.geometry.nearest import along_curve
 from fmr_cli.geometry.se3 import exp
 
-# Of a large source, first a few points; then those that do better in some channel; at the end all.
-LARGE, FEW = 4096, 1024  # points
-NEAR, CLOSE = 0.02, 1e-4  # rad, and units of the normalised cloud: steps that leave most channels, or all, as they are
+# Of a large source, at first a few points; then those that do better than a few in some channel; then all that may win.
+LARGE = 4096  # points
+NEAR, CLOSE = 0.02, 3e-4  # rad, and units of the normalised cloud: steps that leave most channels, or all, as they are
 LAST = 5  # iterations, at least, with all points that matter
-# Of a channel: points this near to winning it are evaluated too. On 10 pairs of rooms and shapes, of 6,144 and 12,288
-# points, 4e-4 took a third look at all points in 6 of them, 1e-3 in 2; with more, the last iterations take longer.
-MARGIN = 1e-3
+# Of a channel: points this near to winning it are evaluated too. Of 36 pairs of rooms and shapes, of 6,144 and 12,288
+# points, with 1e-3 some 17 took a third look at all points, with 3e-3 five; with more, the last iterations take longer.
+MARGIN = 3e-3
 STEEPEST = 2.0  # times the steepest critical point of a target: no channel changes faster with its point (measured)
 MISSED = 1e-2  # of the mean |r|: what the channels may gain by points left out
 MORE = 2  # iterations where they gain more
-
-
-def few(points: np.ndarray) -> np.ndarray:
-    """About FEW of the points, evenly from their order."""
-    return points[:: max(len(points) // FEW, 1)]
 
 
 class NumpySolver(NumpyEncoder):
@@ -96,41 +92,42 @@ class NumpySolver(NumpyEncoder):
     ) -> Solution[np.ndarray]:
         """``solve`` from one start, evaluating only points that can win a channel.
 
-        At first these are few, spread over the source; once a step is small, those of all points that do better than
-        the few in some channel; once it is very small, those within MARGIN of winning, which holds until the points
-        have moved too far. Where it does not hold at the end, all points are looked at, and if some were missed, it
-        goes on with them for at least MORE iterations. The last error is that of all points.
+        At first these are few, spread over the source; once a step is small, those of all points that do better than a
+        few in some channel; once it is very small, those within MARGIN of winning, which holds until the points have
+        moved too far. Where it does not hold at the end, all points are looked at, and if some were missed, it goes on
+        with them for at least MORE iterations. The last error is that of all points.
         """
-        corners = np.array(list(itertools.product(*np.stack([source.min(0), source.max(0)], 1))))
+        source = source[along_curve(source)]
+        corners = np.array(list(itertools.product(*np.stack([source.min(0), source.max(0)], 1), [1.0])))
         slope = STEEPEST * np.linalg.norm(template.J[:, 3:], axis=1).max()
         allowed = MARGIN / max(2 * slope, 1e-12)  # motion, before a point that was left out could win
-        active, near, seen, missed = few(source), False, None, np.inf
+        few = spaced(len(source), FEW)
+        rivals, seen, missed = None, None, 0.0
         errors, iteration, end, size = [], 0, iterations, np.inf
         while True:
             posed = self.posed(g[0])
-            feature, critical = (x[0] for x in self.peaks(active, [posed], run))
             finished = iteration >= end or size < STOP_STEP
-            far = (
-                np.inf
-                if seen is None
-                else np.linalg.norm(corners @ (g - seen)[0, :3, :3].T + (g - seen)[0, :3, 3], axis=1).max()
-            )
-            close = finished or (near and size < CLOSE)
-            if (close and far > allowed) or (not near and (size < NEAR or iteration >= iterations - LAST)):
-                whole, index = self.contenders(source, posed, feature - MARGIN * close, run)
-                missed = float(np.mean(whole - feature))
-                active, feature, near, seen = source[index], whole, True, g if close else None
-                if robust:  # whose step needs to know the points behind the feature
-                    critical = self.peaks(active, [posed], run)[1][0]
-            elif finished:
+            if rivals is not None:
+                feature, critical = self.among(rivals, posed, run)
                 missed = 0.0
+                far = np.inf if seen is None else np.linalg.norm(corners @ (g - seen)[0, :3].T, axis=1).max()
+                if far > allowed and (finished or size < CLOSE):
+                    some = feature
+                    feature, critical, rivals = self.contest(source, posed, some, critical, MARGIN, run)
+                    seen = g if rivals.complete else None
+                    missed = float(np.mean(feature - some))
+            elif finished or size < NEAR or iteration >= iterations - LAST:
+                feature, critical, rivals = self.whole(source, posed, run)
+            else:
+                feature, critical = (x[0] for x in self.peaks(source[few], [posed], run))
+                critical = few[critical]
             r = feature - template.feature
             errors.append(np.abs(r).mean())
             if finished:
                 if missed <= MISSED * errors[-1] or end > iterations:
                     return Solution(g, np.array(errors)[:, None], template.rank)
                 end = max(iterations, iteration + MORE)
-            J_source = self.jacobians(active, critical[None], g) if robust else None
+            J_source = self.jacobians(source, critical[None], g) if robust else None
             dtheta = step(template, r[None], J_source, basis)
             g = exp(dtheta) @ g
             iteration, size = iteration + 1, np.abs(dtheta).max()

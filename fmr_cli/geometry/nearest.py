@@ -36,7 +36,7 @@ class NearestDistance:
 def along_curve(points: np.ndarray) -> np.ndarray:
     """The order of points (N, 3) along a Z-order curve through their box, whose longest side is halved BITS times."""
     low = points.min(0)
-    size = np.maximum(points.max(0) - low, 1e-300)
+    size = np.maximum((points.max(0) - low).astype(float), 1e-300)
     sides, turns = size.copy(), []
     for _ in range(BITS):
         turns.append(int(sides.argmax()))

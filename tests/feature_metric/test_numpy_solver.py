@@ -14,7 +14,9 @@ from fmr_cli.feature_metric.encoder import Encoder, jacobian
 from fmr_cli.feature_metric.numpy_solver import LARGE, NumpySolver
 from fmr_cli.feature_metric.solver import OnDevice
 from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.nearest import along_curve
 from fmr_cli.geometry.se3 import exp
+from fmr_cli.synthetic.shapes import shapes
 
 START = np.eye(4)[None]
 
@@ -47,6 +49,41 @@ def test_feature_and_critical_points_are_those_of_the_encoder(
     values = encoder.pointwise(torch.from_numpy(room[index])).diagonal()
     np.testing.assert_allclose(values, expected[0], rtol=0, atol=1e-5)  # another point only where two are equal
     assert (index == where[0].numpy()).mean() > 0.99
+
+
+@pytest.mark.parametrize("cloud", ["room", "shape", "copies", "plane", "few"])
+def test_only_those_that_can_win_are_multiplied_and_nothing_is_missed(
+    fast: NumpySolver, room: np.ndarray, cloud: str
+) -> None:
+    points = {
+        "room": lambda: room,
+        "shape": lambda: shapes(1, 6200, seed=20_100)[0],
+        "copies": lambda: np.repeat(room[:40], 160, 0),  # every point ties with 159
+        "plane": lambda: room[:6200] * np.float32([1, 1, 0]),
+        "few": lambda: room[:700],
+    }[cloud]()
+    points = points[along_curve(points)]
+    posed = fast.posed(exp(np.array([0.3, -0.5, 0.4, 0.1, 0.0, -0.1])))
+    feature = fast.peaks(points, [posed], map)[0][0]
+    found, critical, rivals = fast.whole(points, posed, map)
+    np.testing.assert_allclose(found, feature, rtol=0, atol=2e-6)
+
+    every = np.concatenate(
+        [fast.last_hidden(part, posed) @ posed[-1][0].T for part in np.split(points, range(256, len(points), 256))]
+    )
+    every += posed[-1][1]
+    np.testing.assert_allclose(every[critical, np.arange(1024)], feature, rtol=0, atol=2e-6)
+    again, _, near = fast.contest(points, posed, found, critical, 5e-3, map)
+    np.testing.assert_array_equal(again, found)
+    paired = np.zeros(every.shape, bool)
+    paired[near.index[near.point], near.channel] = True
+    assert near.complete == (cloud != "copies")
+    if near.complete:
+        assert paired[every > feature - 5e-3 + 4e-6].all()
+        assert not paired[every < feature - 5e-3 - 4e-6].any()
+    for alone, of in (fast.among(x, posed, map) for x in (rivals, near)):
+        np.testing.assert_allclose(alone, feature, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(every[of, np.arange(1024)], feature, rtol=0, atol=2e-6)
 
 
 def test_the_jacobian_is_the_exact_one(fast: NumpySolver, encoder: Encoder, room: np.ndarray) -> None:
