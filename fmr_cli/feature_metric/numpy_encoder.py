@@ -28,7 +28,7 @@ FEW = 512  # points, which are looked at first; 256 to 1,024 take the same time
 # points, it takes the same time (12,288 points of a room).
 AXES, BLOCK = 16, 16
 ROUNDING = 1e-6  # of a squared norm: what float32 leaves between two ways to compute it
-CROWD = 32  # pairs a point: more take longer, on their own, than all points in all channels
+CROWD = 32  # pairs a point of a part, at most: of copies of one point all would tie, in gigabytes
 PAIRS = 512  # of a point and a channel, at once: the activations and weights of so many stay in cache
 
 Run = Callable[[Callable[..., Any], Iterable[Any]], Iterable[Any]]

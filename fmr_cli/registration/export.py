@@ -149,7 +149,9 @@ def summary(source: PointCloud, target: PointCloud, found: Registration) -> list
     ]
     lines += found.reasons
     if found.start == "site":
-        lines.append("by way of a site that the model knows: both scans were found there, whatever they share themselves")
+        lines.append(
+            "by way of a site that the model knows: both scans were found there, whatever they share themselves"
+        )
     if found.alternatives:
         lines.append(f"{len(found.alternatives)} other poses fit about as well: see alternatives in the metrics")
     for cloud in (source, target):

@@ -58,7 +58,8 @@ class Options:
     robust: bool = option(True, "robust steps on both clouds' Jacobians, or the paper's plain ones on the target's")
     refine: bool = option(True, "a last geometric polish (GICP)")
     model: Path | None = option(
-        None, "what `fmr train` has learnt (.safetensors): the encoders, the verdict, sites; the bundled ones if not given"
+        None,
+        "what `fmr train` has learnt (.safetensors): encoders, verdict, sites; the bundled ones if not given",
     )
     device: Literal["auto", "cpu", "cuda"] = option(
         "auto", "where the solver of the global feature runs: cpu, cuda, or auto: the CPU, fast enough for a pair"
