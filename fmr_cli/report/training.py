@@ -101,10 +101,14 @@ def verdict(trainer: Trainer, stopped: bool) -> str:
     progress, task = trainer.progress, trainer.task
     how = f"stopped at step {progress.step}: " if stopped else ""
     where = f"{trainer.folder.path / MODEL}"
-    if progress.check and not progress.check["kept"]:
-        return f"{how}{progress.check['said'][0]}"
+    check = progress.check or {"kept": True, "rows": [], "said": []}
+    if not check["kept"]:
+        return f"{how}{check['said'][-1]}"
+    if check["rows"]:
+        before, after = (sum(row[when]["aligned"] for row in check["rows"]) for when in ("before", "after"))
+        how += f"of {sum(row['pairs'] for row in check['rows'])} held-out pairs {before} were aligned, {after} are; "
     if progress.best == 0:
-        return f"{how}training made it no better than its start; {where} holds the start"
+        return f"{how}training made the encoders no better than their start, which {where} holds"
     before, after = trainer.quality(0)[0], trainer.quality(progress.best)[0]
     more = task.gain(progress.scores["0"], progress.scores[str(progress.best)])
     return (

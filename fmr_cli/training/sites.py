@@ -10,7 +10,7 @@ they don't stand is not kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -35,6 +35,15 @@ DETAIL = 3.0  # points of a site across the voxel edge that suits its scans: wit
 COARSER = 1.26  # times the grid's edge, where a site has too many points: a surface keeps two thirds of them
 PASSES = 3  # in which sites take in what is found there
 
+
+@dataclass(frozen=True)
+class Thin:
+    """A scan as a site keeps it: points (N, 3), file's coordinates; edge: of the voxels that suit it."""
+
+    points: np.ndarray
+    edge: float
+
+
 Part = dict[int, np.ndarray]  # by scan: T_part_scan (4, 4), from the file's coordinates
 
 
@@ -42,13 +51,14 @@ Part = dict[int, np.ndarray]  # by scan: T_part_scan (4, 4), from the file's coo
 class Sites:
     """Makes sites of the scans of ``store``, which are found there by the model file ``model``.
 
-    late: whether there is no time left to look for more scans.
+    late: whether there is no time left to look for more scans. thinned: by scan, what of it is kept.
     """
 
     store: Store
     model: Path | None
     late: Callable[[], bool]
     show: Show
+    thinned: dict[int, Thin] = field(default_factory=dict)
 
     def learn(self, parts: Sequence[Part]) -> list[Part]:
         """The scans of each site that is worth keeping, largest first, of parts that scans have been joined to."""
@@ -135,11 +145,19 @@ class Sites:
 
     def points(self, part: Part, most: int | None = None) -> np.ndarray:
         """(N, 3) what scans of one frame show together, thinned; at most so many points."""
-        scans = {n: self.store.prepared(n) for n in sorted(part)}
-        every = np.concatenate([transform_points(part[n], scan.frame.leave(scan.points)) for n, scan in scans.items()])
+        scans = {n: self.thin(n) for n in sorted(part)}
+        every = np.concatenate([transform_points(part[n], scan.points) for n, scan in scans.items()])
         edge = float(np.median([scan.edge for scan in scans.values()])) / DETAIL
         thin = voxel_downsample(every, edge)
         while most is not None and len(thin) > most:
             edge *= COARSER
             thin = voxel_downsample(every, edge)
         return thin
+
+    def thin(self, number: int) -> Thin:
+        """A scan without the points that no site would keep: of many large ones all points are gigabytes."""
+        if number not in self.thinned:
+            scan = self.store.prepared(number)
+            points = scan.frame.leave(voxel_downsample(scan.points, scan.edge / DETAIL))
+            self.thinned[number] = Thin(points, scan.edge)
+        return self.thinned[number]
