@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmr_cli.geometry.motion import Motion
-from fmr_cli.geometry.pose_error import angle_between
+from fmr_cli.geometry.motion import Motion, moments
 
 SEEDS, NEIGHBOURS = 60, 20
 POWER_STEPS = 4  # of the leading eigenvector: the order of the seeds has settled by then
@@ -28,67 +27,78 @@ def consensus(
     if len(source) < 3:
         return np.zeros((0, 4, 4)), np.zeros(0, int)
     agree = agreeing(source, target, tolerance)
-    T = poses_from_seeds(agree, source, target, tolerance, motion, np.ones(len(source), bool))
+    products = moments(source, target)
+    T = poses_from_seeds(agree, source, target, products, tolerance, motion, np.ones(len(source), bool))
     # Again without the matches of the best pose, so that there is always another one to compare it with.
-    near = within(T, source, target, tolerance)
+    near = within(T, products, tolerance)
     left = ~near[near.sum(1).argmax()]
     if left.sum() >= 3:
-        T = np.concatenate([T, poses_from_seeds(agree, source, target, tolerance, motion, left)])
-    inliers = within(T, source, target, tolerance).sum(1)
+        others = poses_from_seeds(agree, source, target, products, tolerance, motion, left)
+        T, near = np.concatenate([T, others]), np.concatenate([near, within(others, products, tolerance)])
+    inliers = near.sum(1)
+    alike = alike_at(T, source.mean(0), 2 * tolerance)
     kept: list[int] = []
-    moved = T[:, :3, :3] @ source.mean(0) + T[:, :3, 3]
     new = np.ones(len(T), bool)  # which are none of those kept, nor near them
     for i in np.argsort(-inliers, kind="stable"):
-        if not new[i]:
-            continue
-        kept.append(int(i))
-        if len(kept) == count:
-            break
-        turned = angle_between(T[i, :3, :3], T[:, :3, :3]) > APART
-        new &= turned | (np.linalg.norm(moved - moved[i], axis=1) > 2 * tolerance)
+        if new[i] and len(kept) < count:
+            kept.append(int(i))
+            new &= ~alike[i]
     return T[kept], inliers[kept]
 
 
+def alike_at(T: np.ndarray, point: np.ndarray, reach: float) -> np.ndarray:
+    """Which of poses (S, 4, 4) turn by less than APART to each other and take a point (3,) to within reach: (S, S)."""
+    R = T[:, :3, :3].reshape(-1, 9)
+    moved = T[:, :3, :3] @ point + T[:, :3, 3]
+    off = moved[:, None] - moved
+    return (R @ R.T >= 1 + 2 * np.cos(APART)) & (np.einsum("ijk,ijk->ij", off, off) <= reach**2)
+
+
 def poses_from_seeds(
-    agree: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, motion: Motion, use: np.ndarray
+    agree: np.ndarray,
+    source: np.ndarray,
+    target: np.ndarray,
+    products: np.ndarray,
+    tolerance: float,
+    motion: Motion,
+    use: np.ndarray,
 ) -> np.ndarray:
     """A pose for each seed, fitted to its inliers: agree (C, C), 1 where two matches agree -> (S, 4, 4).
 
-    use: (C,), False for matches that do not count.
+    products: the matches' ``moments`` (C, 16); use: (C,), False for matches that do not count.
     """
-    rows = agree if use.all() else agree[use]
-    seeds = spread_seeds(rows, source, target, tolerance, use)
-    second = np.zeros((len(seeds), len(source)), np.float32)
-    second[:, use] = agree[seeds] @ rows.T
+    seeds = spread_seeds(agree, source, target, tolerance, use)
+    second = agree[seeds] @ agree
     second *= agree[seeds]
+    second *= use
     members = np.argpartition(-second, min(NEIGHBOURS, len(source)) - 1, axis=1)[:, :NEIGHBOURS]
     T = motion.fit(source[members], target[members], np.take_along_axis(second, members, 1).astype(float))
-    source, target = source[use], target[use]
+    products = products[use]
     going, before = np.arange(len(T)), np.zeros((len(T), 0), bool)
     for _ in range(ROUNDS):
-        near = within(T[going], source, target, tolerance)
+        near = within(T[going], products, tolerance)
         if before.size:  # a pose that has the same inliers as before stays where it is
             changed = (near != before).any(1)
             going, near = going[changed], near[changed]
         if not len(going):
             break
-        T[going], before = motion.fit(source[None], target[None], near + 1e-9), near
+        T[going], before = motion.fit_sums((near + 1e-9) @ products), near
     return T
 
 
 def spread_seeds(
-    rows: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, use: np.ndarray
+    agree: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float, use: np.ndarray
 ) -> np.ndarray:
     """The matches that most others agree with, of one place at most one: at most SEEDS indices.
 
     By the leading eigenvector of the matrix of agreement (spectral matching, Leordeanu and Hebert 2005), from a few
-    power steps. rows: (U, C) of that matrix, those of the matches that are in ``use`` (C,).
+    power steps. use: (C,), False for matches that do not count.
     """
     weight = use.astype(np.float32)
     for _ in range(POWER_STEPS):
-        found = rows @ weight
-        weight[use] = found / max(float(found.max()), 1e-30)
-    order = np.argsort(-weight, kind="stable")[: len(rows)]
+        found = (agree @ weight) * use
+        weight = found / max(float(found.max()), 1e-30)
+    order = np.argsort(-weight, kind="stable")[: np.count_nonzero(use)]
     order = order[use[order]]
     places = np.hstack([source, target])
     seeds: list[int] = []
@@ -113,35 +123,41 @@ def near_each_other(a: np.ndarray, b: np.ndarray, tolerance: float) -> np.ndarra
     return near
 
 
-def within(T: np.ndarray, source: np.ndarray, target: np.ndarray, tolerance: float) -> np.ndarray:
-    """Which matches lie within ``tolerance`` under which pose: T (B, 4, 4), (C, 3), (C, 3) -> (B, C).
+def within(T: np.ndarray, products: np.ndarray, tolerance: float) -> np.ndarray:
+    """Which matches lie within ``tolerance`` under which pose: T (B, 4, 4), ``moments`` (C, 16) -> (B, C).
 
     |R s + t - q|² = |s|² + |q|² + |t|² + 2 (Rᵀt)·s - 2 t·q - 2 Σ R_ij q_i s_j, which is one matrix product.
     """
     R, t = T[:, :3, :3], T[:, :3, 3]
-    squares = (source * source).sum(1) + (target * target).sum(1)
-    matches = np.vstack([squares, source.T, target.T, (target[:, :, None] * source[:, None]).reshape(-1, 9).T])
+    squares = (products[:, 1:7] ** 2).sum(1)
     back = (t[:, None] @ R)[:, 0]
-    poses = np.hstack([np.ones((len(T), 1)), 2 * back, -2 * t, -2 * R.reshape(-1, 9)])
-    return poses @ matches < (tolerance**2 - (t * t).sum(1))[:, None]
+    poses = np.hstack([(t * t).sum(1)[:, None], 2 * back, -2 * t, -2 * R.reshape(-1, 9)])
+    return poses @ products.T < tolerance**2 - squares
 
 
 def agreeing(source: np.ndarray, target: np.ndarray, tolerance: float) -> np.ndarray:
     """1 where two matches are as far apart in both scans, else 0: source, target (C, 3) -> (C, C) float32."""
-    x, y = source.astype(np.float32), target.astype(np.float32)
-    agree = np.empty((len(x), len(x)), np.float32)
-    for first in range(0, len(x), BLOCK):
-        apart = distances(x[first:], BLOCK)
-        apart -= distances(y[first:], BLOCK)
+    x, y = squared_distances(source), squared_distances(target)
+    agree = np.empty((len(source), len(source)), np.float32)
+    for first in range(0, len(source), BLOCK):
+        apart = distances(*x, first)
+        apart -= distances(*y, first)
         agree[first : first + BLOCK, first:] = np.abs(apart, out=apart) < tolerance
         agree[first:, first : first + BLOCK] = agree[first : first + BLOCK, first:].T
     return agree
 
 
-def distances(x: np.ndarray, count: int) -> np.ndarray:
-    """From the first ``count`` points to all: (C, 3) float32 -> (count, C); exact enough about their mean."""
-    squared = (x * x).sum(1)
-    d2 = (-2 * x[:count]) @ x.T
-    d2 += squared
-    d2 += squared[:count, None]
+def squared_distances(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two factors (C, 5) and (5, C) whose product is points' squared distances, float32; exact enough about their mean.
+
+    |a - b|² = |a|² + |b|² - 2 a·b, all of it as one product.
+    """
+    x = points.astype(np.float32)
+    one, squared = np.ones((len(x), 1), np.float32), (x * x).sum(1, keepdims=True)
+    return np.hstack([x, squared, one]), np.ascontiguousarray(np.hstack([-2 * x, one, squared]).T)
+
+
+def distances(a: np.ndarray, b: np.ndarray, first: int) -> np.ndarray:
+    """From BLOCK points to all from ``first`` on, by the factors of ``squared_distances``: (BLOCK, C - first)."""
+    d2 = a[first : first + BLOCK] @ b[:, first:]
     return np.sqrt(np.maximum(d2, 0, out=d2), out=d2)

@@ -74,19 +74,27 @@ class Motion:
 
     def fit(self, source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """The weighted least squares motions: source, target (B or 1, n, 3), weight (B, n) -> (B, 4, 4)."""
-        products = (target[..., :, None] * source[..., None, :]).reshape(*source.shape[:2], 9)
-        moments = np.concatenate([np.ones_like(source[..., :1]), source, target, products], -1)
+        products = moments(source, target)
         # Of points that all share, one product: a batch of products with one row each takes several times as long.
-        sums = weight @ moments[0] if len(moments) == 1 else (weight[:, None] @ moments)[:, 0]
+        return self.fit_sums(weight @ products[0] if len(products) == 1 else (weight[:, None] @ products)[:, 0])
+
+    def fit_sums(self, sums: np.ndarray) -> np.ndarray:
+        """The motions that ``fit`` gives, of the weighted sums of ``moments``: (B, 16) -> (B, 4, 4)."""
         means = sums[:, 1:] / np.maximum(sums[:, :1], 1e-12)
         a, b, products = means[:, :3], means[:, 3:6], means[:, 6:].reshape(-1, 3, 3)
-        T = np.tile(np.eye(4), (len(weight), 1, 1))
+        T = np.tile(np.eye(4), (len(sums), 1, 1))
         T[:, :3, :3] = self.rotation(products - b[:, :, None] * a[:, None])
         shift = b - (T[:, :3, :3] @ a[:, :, None])[..., 0]
         if self.dof == "planar":
             shift = shift + (self.lift - shift @ self.up)[:, None] * self.up
         T[:, :3, 3] = shift
         return T
+
+
+def moments(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Of matched points s, t (..., n, 3): 1, s, t and the products t_i s_j, (..., n, 16)."""
+    products = (target[..., :, None] * source[..., None, :]).reshape(*source.shape[:-1], 9)
+    return np.concatenate([np.ones_like(source[..., :1]), source, target, products], -1)
 
 
 def rotations(count: int) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""Distances from very many points to a cloud."""
+"""Nearest points: distances from very many points to a cloud, and many neighbours of a few."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from fmr_cli.cores import usable_cores
 
@@ -31,6 +32,31 @@ class NearestDistance:
         result = np.empty(len(queries))
         result[order] = np.sqrt(np.asarray(squared).reshape(-1))
         return result
+
+
+def nearest_within(tree: cKDTree, centres: np.ndarray, radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The at most ``count`` points of a tree within ``radius`` of centres (K, 3): rows (K, count), nearest first.
+
+    And which of them are there; 0 where they are not. All pairs within the radius, sorted as one array of numbers, take
+    half of the time of the tree's own search for many neighbours, which keeps a heap for each centre.
+    """
+    pairs = cKDTree(centres, balanced_tree=False, compact_nodes=False).sparse_distance_matrix(
+        tree, radius, output_type="ndarray"
+    )
+    # A number each: the centre, how far, the row. Of a thousand centres and a million points, in steps of 2^-32 radii.
+    row_bits = tree.n.bit_length()
+    bits = 62 - row_bits - len(centres).bit_length()
+    key = (pairs["v"] * ((2**bits - 1) / radius)).astype(np.int64)
+    key |= pairs["i"].astype(np.int64) << bits
+    key <<= row_bits
+    key |= pairs["j"]
+    key.sort()
+    counts = np.bincount(pairs["i"], minlength=len(centres))
+    rank = np.arange(len(key)) - np.repeat(np.cumsum(counts) - counts, counts)
+    there = np.arange(count) < counts[:, None]
+    found = np.zeros(there.shape, np.int64)
+    found[there] = key[rank < count] & ((1 << row_bits) - 1)
+    return found, there
 
 
 def along_curve(points: np.ndarray) -> np.ndarray:

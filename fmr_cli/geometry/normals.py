@@ -14,6 +14,14 @@ def neighbours(points: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarra
     return tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
 
 
+def neighbours_of_all(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``neighbours`` of points (M, 3) among themselves: small_gicp's search takes half of the time of scipy's."""
+    import small_gicp
+
+    index, squared = small_gicp.KdTree(points).batch_knn_search(points, min(NORMAL_NEIGHBOURS, len(points)))
+    return np.sqrt(squared), index.astype(np.int64)
+
+
 def normals_and_variation(
     points: np.ndarray, distance: np.ndarray, index: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

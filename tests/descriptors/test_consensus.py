@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 from fmr_cli.cloud import transform_points
 from fmr_cli.descriptors.consensus import BLOCK, SEEDS, agreeing, consensus, spread_seeds, within
 from fmr_cli.descriptors.matching import match
-from fmr_cli.geometry.motion import Motion
+from fmr_cli.geometry.motion import Motion, moments
 from fmr_cli.geometry.pose_error import angle_between
 from fmr_cli.geometry.se3 import exp
 
@@ -99,14 +99,14 @@ def test_matches_within_reach_are_those_with_small_residuals() -> None:
     T = np.stack([pose((1.0, -2.0, 0.4)), np.eye(4)])
     apart = np.linalg.norm(transform_points(T, source) - target, axis=2)
     for tolerance in (0.03, 3.0):
-        assert np.array_equal(within(T, source, target, tolerance), apart < tolerance)
+        assert np.array_equal(within(T, moments(source, target), tolerance), apart < tolerance)
 
 
 def test_seeds_are_the_first_of_each_place_in_the_order_of_their_weight() -> None:
     source, target = matches(0.3, pose((1.0, -2.0, 0.4)), 3 * BLOCK)
     agree = agreeing(source, target, TOLERANCE)
     use = np.arange(len(source)) % 4 > 0
-    seeds = spread_seeds(agree[use], source, target, 10 * TOLERANCE, use).tolist()
+    seeds = spread_seeds(agree, source, target, 10 * TOLERANCE, use).tolist()
     weight = use.astype(float)
     for _ in range(4):
         weight = (agree @ weight) * use
