@@ -214,15 +214,13 @@ class Judge:
         """Gather the evidence at a pose, and weigh all candidates anew."""
         found = agreement(self.pair.s, self.pair.t, T_target_source)
         evidence = Evidence(**asdict(found), votes=self.pair.inlier_count(T_target_source), repeats=self.repeats)
-        known = next((c for c in self.candidates if self.pair.same(T_target_source, c.T_target_source)), None)
-        if known is not None:  # found again: where it came from first is where it comes from
-            start, errors = known.start, known.errors or errors
-        new = Candidate(T_target_source, start, errors, evidence)
-        kept: list[Candidate] = []
-        for c in sorted([new, *self.candidates], key=lambda c: -c.evidence.merit):
-            if not any(self.pair.same(c.T_target_source, k.T_target_source) for k in kept):
-                kept.append(c)
-        self.weigh(kept)
+        known, others = list[Candidate](), list[Candidate]()
+        for c in self.candidates:
+            (known if self.pair.same(T_target_source, c.T_target_source) else others).append(c)
+        if known:  # found again: where it came from first is where it comes from
+            start, errors = known[0].start, known[0].errors or errors
+        if all(evidence.merit >= c.evidence.merit for c in known):
+            self.weigh([Candidate(T_target_source, start, errors, evidence), *others])
 
     def weigh(self, candidates: list[Candidate]) -> None:
         """Weigh candidates against each other, best first, in a scene that repeats itself as much as is known."""

@@ -51,6 +51,7 @@ class Pair:
         lift = float(up @ (source.centre - target.centre))  # what "planar" keeps of the shift between centred frames
         self.motion = Motion(options.dof, (float(up[0]), float(up[1]), float(up[2])), lift)
         self.s, self.t = self.both(lambda cloud: cloud.surface(edge))
+        self._scores: dict[bytes, float] = {}  # by pose
         for cloud, surface in ((source, self.s), (target, self.t)):
             if len(surface.points) < MIN_POINTS:
                 what = f"fewer than {MIN_POINTS} voxels of {edge:.3g} hold points; lower --voxel-size"
@@ -164,10 +165,16 @@ class Pair:
 
     def overlap_score(self, T_target_source: np.ndarray) -> float:
         """How much of the source comes close to the target at a pose, normals along, from 0 to 1, on few points."""
+        key = T_target_source.tobytes()  # a pose is asked about when it is found, ranked, refined and found again
+        if key not in self._scores:
+            self._scores[key] = self._overlap_score(T_target_source)
+        return self._scores[key]
+
+    def _overlap_score(self, T_target_source: np.ndarray) -> float:
         points, normals = self.some
         reach = 2 * self.edge
         d, i = self.t.tree.query(transform_points(T_target_source, points), distance_upper_bound=reach)
-        here = np.isfinite(d)
+        here = np.flatnonzero(np.isfinite(d))
         cosine = np.einsum("ni,ni->n", normals[here] @ T_target_source[:3, :3].T, self.t.normals[i[here]])
         return float(((1 - d[here] / reach) * cosine**4).sum() / len(points))
 
