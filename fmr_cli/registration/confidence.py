@@ -213,14 +213,23 @@ class Judge:
     def consider(self, T_target_source: np.ndarray, start: str, errors: list[float]) -> None:
         """Gather the evidence at a pose, and weigh all candidates anew."""
         found = agreement(self.pair.s, self.pair.t, T_target_source)
-        evidence = Evidence(**asdict(found), votes=self.pair.inlier_count(T_target_source), repeats=self.repeats)
+        evidence = Evidence(**asdict(found), votes=self.pair.inlier_count(T_target_source))
+        self.take(Candidate(T_target_source, start, errors, evidence))
+
+    def adopt(self, known: Candidate) -> None:
+        """Take over a candidate of another look on the same voxels: what its surfaces say stays, matches are others."""
+        votes = self.pair.inlier_count(known.T_target_source)
+        self.take(replace(known, evidence=replace(known.evidence, votes=votes)))
+
+    def take(self, new: Candidate) -> None:
+        """Weigh all candidates anew, with another one; of several at one pose the one of most merit stays."""
         known, others = list[Candidate](), list[Candidate]()
         for c in self.candidates:
-            (known if self.pair.same(T_target_source, c.T_target_source) else others).append(c)
+            (known if self.pair.same(new.T_target_source, c.T_target_source) else others).append(c)
         if known:  # found again: where it came from first is where it comes from
-            start, errors = known[0].start, known[0].errors or errors
-        if all(evidence.merit >= c.evidence.merit for c in known):
-            self.weigh([Candidate(T_target_source, start, errors, evidence), *others])
+            new = replace(new, start=known[0].start, errors=known[0].errors or new.errors)
+        if all(new.evidence.merit >= c.evidence.merit for c in known):
+            self.weigh([new, *others])
 
     def weigh(self, candidates: list[Candidate]) -> None:
         """Weigh candidates against each other, best first, in a scene that repeats itself as much as is known."""

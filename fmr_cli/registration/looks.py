@@ -109,13 +109,18 @@ def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None, known:
 
 
 def look_again(judge: Judge, former: Judge | None, time: Stopwatch) -> None:
-    """Judge the best poses that a former look has found."""
+    """Judge the best poses that a former look has found: refined anew, unless it was on the same voxels."""
     known = former.candidates[:AGAIN] if former else []
     if known:
         with time.stage("describe"):
             judge.pair.describe()
     with time.stage("refine"):
-        judge_refined(judge, [h for c in known for h in hypotheses.from_pose(judge.pair, c.T_target_source, c.start)])
+        if former and former.pair.edge == judge.pair.edge:
+            for c in known:
+                judge.adopt(c)
+        else:
+            again = [h for c in known for h in hypotheses.from_pose(judge.pair, c.T_target_source, c.start)]
+            judge_refined(judge, again)
 
 
 def further(
