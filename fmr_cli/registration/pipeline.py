@@ -19,7 +19,7 @@ from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, mirror, places, refinement, sites
 from fmr_cli.registration.confidence import LIKELY, Candidate, Judge
-from fmr_cli.registration.looks import CLOSER, FIRST, SURE, at_once, coarse_look, likely
+from fmr_cli.registration.looks import CLOSER, FIRST, HOPELESS, SURE, at_once, coarse_look, likely
 from fmr_cli.registration.models import model
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -28,6 +28,7 @@ from fmr_cli.registration.result import Registration, Stopwatch, describe
 from fmr_cli.registration.units import factor_of, unit_hint
 
 CHECKS = 5  # iterations of the IC solver from the pose found, where asked for
+SOUGHT = ("features", "search", "rival")  # starts that nobody gave: where the pose is hopeless, a polish mends nothing
 SCALES = (1.0, 0.8, 1.25)  # tried about the ratio of the clouds' sizes
 
 
@@ -151,7 +152,7 @@ def as_they_are(
         factor, judge = max(verdicts, key=lambda verdict: verdict[1].best.confidence)
         best = judge.best
         polished = refinement.Polished(best.T_target_source)
-        if options.refine:
+        if options.refine and (judge.sure(HOPELESS) or best.start not in SOUGHT):
             with time.stage("polish"):
                 polished = refinement.exact(judge.pair, refinement.by_geometry(judge.pair, best.T_target_source))
                 best = replace(best, T_target_source=polished.T_target_source)
