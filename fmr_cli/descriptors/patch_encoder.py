@@ -92,15 +92,22 @@ class LocalEncoder:
         return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
 
     def pooled(self, patches: np.ndarray, room: list[np.ndarray]) -> np.ndarray:
-        """The maximum over the points of the MLP; the last bias and ReLU come after it, which is the same."""
+        """The maximum over the points of the MLP; its last bias and ReLU come after it, which is the same."""
         x = patches.reshape(-1, patches.shape[-1])
-        for (weight, bias), out in zip(self.point[:-1], room[:-1], strict=True):
+        for (weight, _), bias, out in zip(self.point[:-1], self.late[:-1], room[:-1], strict=True):
             x = np.matmul(x, weight.T, out=out[: len(x)])
-            x += bias
-            np.maximum(x, 0, out=x)
-        weight, bias = self.point[-1]
-        x = np.matmul(x, weight.T, out=room[-1][: len(x)]).reshape(*patches.shape[:2], -1).max(1)
-        return np.maximum(x + bias, 0)
+            np.maximum(x, -bias, out=x)
+        x = np.matmul(x, self.point[-1][0].T, out=room[-1][: len(x)]).reshape(*patches.shape[:2], -1).max(1)
+        return np.maximum(x + self.late[-1], 0)
+
+    @cached_property
+    def late(self) -> list[np.ndarray]:
+        """The biases of the points' MLP as ``pooled`` adds them, late: relu(z + b) = max(z, -b) + b, and that b goes
+        through the next layer's matrix into its bias. One pass over an activation in place of two."""
+        late = [self.point[0][1]]
+        for weight, bias in self.point[1:]:
+            late.append(bias + weight @ late[-1])
+        return late
 
 
 def with_all_channels(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -121,7 +128,7 @@ def reference_frames(offsets: np.ndarray, valid: np.ndarray, normal: np.ndarray)
     height = (offsets @ normal[..., None])[..., 0] * valid
     sign = np.where(height.sum(1) > 0, -1, 1).astype(offsets.dtype)
     z = sign[:, None] * normal
-    near = np.square(np.maximum(1 - np.sqrt((offsets * offsets).sum(-1)), 0)) * valid
+    near = np.square(np.maximum(1 - np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)), 0)) * valid
     weight = near * (height * height + FLAT**2)
     # The weighted sum of offsets - height z, less what rounding leaves along z.
     x = (weight[:, None] @ offsets)[:, 0] - (sign * (weight * height).sum(1))[:, None] * z
@@ -145,19 +152,23 @@ def describe_patches(
     count = np.maximum(valid.sum(1, keepdims=True), 1)
     chosen = ((np.arange(PATCH_POINTS, dtype=np.float32) + 0.5) / PATCH_POINTS * count).astype(int)  # [K x POINTS]
     out = np.empty((*chosen.shape, CHANNELS), np.float32)
-    p = np.take_along_axis(offsets, chosen[..., None], 1) @ frame
-    n = normals[np.take_along_axis(neighbours, chosen, 1)] @ frame
+    rows = np.arange(len(chosen))[:, None]
+    p = offsets[rows, chosen] @ frame
+    n = normals[neighbours[rows, chosen]] @ frame
     out[..., :3], out[..., 3:6] = p, n * n
-    np.multiply(n[..., 0], n[..., 1], out=out[..., 6])
-    np.multiply(n[..., 0], n[..., 2], out=out[..., 7])
-    np.multiply(n[..., 1], n[..., 2], out=out[..., 8])
-    out[..., 9] = np.sqrt((p * p).sum(-1))
-    out[..., 10] = radius = np.hypot(p[..., 0], p[..., 1])
-    outward = p[..., :2] / np.maximum(radius, 1e-6)[..., None]
-    n_out = (n[..., :2] * outward).sum(-1)
-    n_about = n[..., 1] * outward[..., 0] - n[..., 0] * outward[..., 1]
+    # Component by component: sums over an axis of two or three take several times as long.
+    (x, y, z), (nx, ny, nz) = np.moveaxis(p, -1, 0), np.moveaxis(n, -1, 0)
+    np.multiply(nx, ny, out=out[..., 6])
+    np.multiply(nx, nz, out=out[..., 7])
+    np.multiply(ny, nz, out=out[..., 8])
+    across2 = x * x + y * y
+    out[..., 9] = np.sqrt(across2 + z * z)
+    out[..., 10] = radius = np.sqrt(across2)
+    radius = np.maximum(radius, 1e-6)
+    x, y = x / radius, y / radius  # outward
+    n_out, n_about = nx * x + ny * y, ny * x - nx * y
     np.multiply(n_out, n_out, out=out[..., 11])
-    np.multiply(n_out, n[..., 2], out=out[..., 12])
+    np.multiply(n_out, nz, out=out[..., 12])
     np.multiply(n_out, n_about, out=out[..., 13])
-    np.multiply(n_about, n[..., 2], out=out[..., 14])
+    np.multiply(n_about, nz, out=out[..., 14])
     return out
