@@ -46,8 +46,19 @@ def voxel_ranks(points: np.ndarray, edge: float) -> np.ndarray:
 
 def occupied_voxels(points: np.ndarray, edge: float) -> int:
     """How many voxels of the given edge hold a point; the grid begins at the points' lower corner."""
-    keys = np.sort(voxel_keys(points - points.min(0), edge))
-    return 1 + int(np.count_nonzero(keys[1:] != keys[:-1]))
+    columns = np.array(points.T, float, order="C")  # a copy: thrice as fast as the points' rows
+    columns -= columns.min(1, keepdims=True)
+    cells, key = 1.0, np.zeros(len(points))
+    for c in columns:  # the voxel's number in the points' box
+        c /= edge
+        count = np.floor(c, out=c).max() + 1
+        cells *= count
+        key *= count
+        key += c
+    if cells >= 2**53:  # a float holds no such number
+        key = voxel_keys(points - points.min(0), edge)
+    key.sort()
+    return 1 + int(np.count_nonzero(key[1:] != key[:-1]))
 
 
 def voxel_keys(points: np.ndarray, edge: float) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmr_cli.geometry.voxels import voxel_downsample, voxel_keys
+from fmr_cli.geometry.voxels import occupied_voxels, voxel_downsample, voxel_keys
 
 
 def test_equal_keys_are_equal_voxels_in_the_order_of_their_indices() -> None:
@@ -27,3 +27,12 @@ def test_the_grid_is_the_mean_of_each_voxel_by_z_then_y_then_x(far: float) -> No
 def test_a_voxel_far_away_meets_no_other() -> None:
     line = np.arange(-(2**20), 2**20, 1000)[:, None] * np.eye(3)[[0]] + 0.5
     assert len(np.unique(voxel_keys(line, 1.0))) == len(line)
+
+
+@pytest.mark.parametrize("far", [0.0, 1e5])  # the second: a box of more voxels than a float counts
+def test_the_occupied_voxels_are_those_of_their_keys(far: float) -> None:
+    points = np.append(np.random.default_rng(0).uniform(-3, 3, (5000, 3)), [[far, -far, far]], axis=0)
+    given = points.copy(order="F")
+    expected = len(np.unique(np.floor((points - points.min(0)) / 0.05), axis=0))
+    assert occupied_voxels(given, 0.05) == expected
+    assert np.array_equal(given, points)
