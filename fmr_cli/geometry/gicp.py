@@ -11,6 +11,8 @@ from fmr_cli.geometry.observability import Observations
 COVARIANCE_NEIGHBOURS = 10  # points: small_gicp's own default
 REACH = 1.0  # voxel edges: partners further apart are none, in the end
 THIN = 1e-3  # of a point's covariance along its normal, that along the surface being 1: small_gicp's own
+# Points, fewer of which one thread prepares in some milliseconds; a second one that waits for more spins for ten.
+MANY = 10_000
 
 
 class GicpCloud:
@@ -22,6 +24,7 @@ class GicpCloud:
     def __init__(self, points: np.ndarray, edge: float, threads: int = 1) -> None:
         import small_gicp
 
+        threads = threads if len(points) > MANY else 1
         # In this order what is near in space is near in memory: of 100,000 points it takes a third of the time off
         self.cloud = small_gicp.PointCloud(points[along_curve(points)] / edge)
         self.tree = small_gicp.KdTree(self.cloud, threads)

@@ -100,7 +100,8 @@ def rivals(pair: Pair, T_target_source: np.ndarray) -> tuple[list[Hypothesis], f
     back = np.linalg.inv(T_target_source)
     score = pair.overlap_score(T_target_source)
     turns = [*half_turns(pair.t.points), *(T_target_source @ S @ back for S in half_turns(pair.s.points))]
-    generators = [S for S in turns if pair.overlap_score(S @ T_target_source) >= HALF_TURNED * score]
+    least = HALF_TURNED * score
+    generators = [S for S in turns if pair.overlap_score(S @ T_target_source, least) >= least]
     x, y = runners_up(pair, T_target_source)
     repeats = 0.0
     if len(x) >= RIVAL_MATCHES:
@@ -122,7 +123,7 @@ def orbit(pair: Pair, T_target_source: np.ndarray, generators: list[np.ndarray],
         if pair.among(T, np.array(tried)):
             continue
         tried.append(T)
-        score = pair.overlap_score(T)
+        score = pair.overlap_score(T, floor)
         if score >= floor and pair.allowed(T):
             found.append(Hypothesis(T, "rival", score))
             queue += [S @ T for S in generators]

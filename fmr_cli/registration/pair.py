@@ -29,6 +29,7 @@ from fmr_cli.registration.units import unit_hint
 KEYPOINTS = 500  # of a cloud
 CONSENSUS_TOLERANCE = 2.0  # voxel edges: how far a keypoint's place may lie off in two samplings of one surface
 RANKING_POINTS = 800  # of the source, on which poses are compared
+RANKED_FIRST = 4  # one in so many of these tells a score to 0.03: where it is half of what is asked for, it is below
 DISTINCT_DEGREES, DISTINCT_EDGES = 10.0, 4.0  # poses nearer than both are one: a refinement moves them together
 
 
@@ -163,15 +164,20 @@ class Pair:
         both = sample(solid, RANKING_POINTS, np.random.default_rng(self.seed))
         return both[:, :3], both[:, 3:]
 
-    def overlap_score(self, T_target_source: np.ndarray) -> float:
-        """How much of the source comes close to the target at a pose, normals along, from 0 to 1, on few points."""
+    def overlap_score(self, T_target_source: np.ndarray, floor: float = 0.0) -> float:
+        """How much of the source comes close to the target at a pose, normals along, from 0 to 1, on few points.
+
+        floor: what is below it may be told as 0; of what is plainly so, one point in RANKED_FIRST is asked.
+        """
         key = T_target_source.tobytes()  # a pose is asked about when it is found, ranked, refined and found again
         if key not in self._scores:
+            if floor and self._overlap_score(T_target_source, RANKED_FIRST) < floor / 2:
+                return 0.0
             self._scores[key] = self._overlap_score(T_target_source)
         return self._scores[key]
 
-    def _overlap_score(self, T_target_source: np.ndarray) -> float:
-        points, normals = self.some
+    def _overlap_score(self, T_target_source: np.ndarray, every: int = 1) -> float:
+        points, normals = (x[::every] for x in self.some)
         reach = 2 * self.edge
         d, i = self.t.tree.query(transform_points(T_target_source, points), distance_upper_bound=reach)
         here = np.flatnonzero(np.isfinite(d))
