@@ -65,7 +65,9 @@ def at_once(
         looks = [WIDER] if options.voxel_size else [FIRST, CLOSER, WIDER][len(judges) :]
     for look in looks:
         with suppress(RegistrationError):  # too few voxels of that size
-            judges.append(coarse_look(make_pair(source, target, options, threads, *look), time, surest(judges)))
+            # On other voxels poses are refined anew: those without hope are not worth it.
+            hopeful = [j for j in judges if look != WIDER or j.sure(HOPELESS)]
+            judges.append(coarse_look(make_pair(source, target, options, threads, *look), time, surest(hopeful)))
             if judges[-1].sure(COARSE[look]):
                 return finer(judges[-1])
     coarse = surest(judges)
