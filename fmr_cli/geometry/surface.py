@@ -29,9 +29,10 @@ class Surface:
     all objects that share it.
     """
 
-    def __init__(self, points: np.ndarray, edge: float) -> None:
+    def __init__(self, points: np.ndarray, edge: float, thinned: bool = False) -> None:
+        """thinned: the points are the voxels' means already."""
         self.edge = edge
-        self.points = voxel_downsample(points, edge)
+        self.points = points if thinned else voxel_downsample(points, edge)
         self._tree: cKDTree | None = None
         self._known: Shape | None = None
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 BITS = 21  # of a voxel's index along an axis: three times 21 fit an int64
@@ -20,6 +22,44 @@ def voxel_downsample(points: np.ndarray, edge: float) -> np.ndarray:
 def voxel_means(values: np.ndarray, rank: np.ndarray) -> np.ndarray:
     """The mean of values (N, d) in each voxel, by the ``voxel_ranks`` (N,) of their points: (M, d)."""
     return np.stack([np.bincount(rank, c) for c in values.T], 1) / np.bincount(rank)[:, None]
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Points summed up in the occupied voxels of a grid: from these, grids of 2, 4, ... times the edge take little.
+
+    sums: (M, 3); counts: (M,); some: (M, 3) one point of each, which says where the voxel is, as its mean on a border
+    may not. In the order of ``voxel_downsample``.
+    """
+
+    edge: float
+    sums: np.ndarray
+    counts: np.ndarray
+    some: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, edge: float) -> Voxels:
+        """Those of points (N, 3)."""
+        return cls._merged(edge, voxel_ranks(points, edge), points, None, points)
+
+    def doubled(self) -> Voxels:
+        """Those of twice the edge: a border of theirs is one of these, to the bit."""
+        return self._merged(2 * self.edge, voxel_ranks(self.some, 2 * self.edge), self.sums, self.counts, self.some)
+
+    @property
+    def means(self) -> np.ndarray:
+        """What ``voxel_downsample`` gives, to rounding: (M, 3)."""
+        return self.sums / self.counts[:, None]
+
+    @classmethod
+    def _merged(
+        cls, edge: float, rank: np.ndarray, sums: np.ndarray, counts: np.ndarray | None, some: np.ndarray
+    ) -> Voxels:
+        """What falls into one voxel by its rank (N,), summed up."""
+        counts = np.bincount(rank, counts)
+        which = np.empty(len(counts), np.int64)
+        which[rank] = np.arange(len(rank))
+        return cls(edge, np.stack([np.bincount(rank, c) for c in sums.T], 1), counts, some[which])
 
 
 def voxel_ranks(points: np.ndarray, edge: float) -> np.ndarray:

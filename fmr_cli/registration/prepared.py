@@ -18,7 +18,7 @@ from fmr_cli.geometry.sampling import distinct, reach, sample, thinned, working_
 from fmr_cli.geometry.smoothing import Roughness, roughness
 from fmr_cli.geometry.strays import Strays, strays
 from fmr_cli.geometry.surface import MIRRORED, Surface
-from fmr_cli.geometry.voxels import voxel_downsample
+from fmr_cli.geometry.voxels import Voxels, voxel_downsample
 from fmr_cli.io.crs import code_of, in_degrees, name_of, same
 from fmr_cli.registration.memo import Memo
 
@@ -27,6 +27,7 @@ AT_MOST = 1_000_000  # points of a cloud that are looked at: a hundred and more 
 SPACINGS = 2.0  # a voxel edge spans, at least, so that a surface fills its voxels
 LARGEST_RATIO = 3.0  # of the two clouds' own voxel edges
 AT_A_TIME = 1000  # patches of a map: 100 MB
+LARGE = 200_000  # points: sorting them into voxels takes longer than all else that is known of their grid
 KEPT = 6  # results of each kind that a cloud keeps: the grids and features of one pair, for its next pair
 
 
@@ -90,6 +91,7 @@ class Prepared:
     def _forget(self) -> None:
         """What is computed from the points, for each kind of it: nothing yet."""
         self._surfaces, self._described, self._fine, self._gicp, self._roughness = (Memo(KEPT) for _ in range(5))
+        self._grids = Memo(KEPT)
         self.on_sites = Memo(KEPT)  # what is found of it there, by site
 
     @property
@@ -131,9 +133,23 @@ class Prepared:
 
         def make() -> Surface:
             own = self._seen_in_mirror
-            return own.surface(edge).mirrored() if own else Surface(self.points, edge)
+            return own.surface(edge).mirrored() if own else Surface(self.thinned(edge, 2), edge, thinned=True)
 
         return self._surfaces.get(edge, make)
+
+    def thinned(self, edge: float, halvings: int = 0) -> np.ndarray:
+        """The centred points' means in voxels of ``edge``: (M, 3).
+
+        halvings: how many times half the edge will be asked for as well; of a large cloud, the finest grid is made
+        first, and the others of it.
+        """
+        return self._voxels(edge, halvings).means if len(self.points) > LARGE else voxel_downsample(self.points, edge)
+
+    def _voxels(self, edge: float, halvings: int) -> Voxels:
+        def make() -> Voxels:
+            return self._voxels(edge / 2, halvings - 1).doubled() if halvings else Voxels.of(self.points, edge)
+
+        return self._grids.get(edge, make)
 
     def described(self, edge: float, count: int, encoder: LocalEncoder) -> tuple[np.ndarray, np.ndarray]:
         """At most ``count`` keypoints (K, 3), centred, and their descriptors (K, d).
@@ -176,7 +192,7 @@ class Prepared:
         """At most ``count`` points for the polish: the cloud's own where it is not too large, else on a fine grid."""
 
         def thin() -> np.ndarray:
-            points = self.points if len(self.points) <= 4 * count else voxel_downsample(self.points, edge / 2)
+            points = self.points if len(self.points) <= 4 * count else self.thinned(edge / 2)
             return sample(points, count, np.random.default_rng(self.seed))
 
         return self._fine.get((count, edge), thin)

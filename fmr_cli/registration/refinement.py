@@ -21,7 +21,6 @@ from fmr_cli.geometry.point_to_plane import constrained, face_along, point_to_pl
 from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.smoothing import NEAR, Roughness, local_planes
 from fmr_cli.geometry.surface import Surface
-from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.pair import RANKING_POINTS, Pair
 from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS
@@ -252,7 +251,7 @@ def exact(pair: Pair, polished: Polished) -> Polished:
     fine = max(pair.edge / FINER, SPACINGS * source.spacing, SPACINGS * target.spacing)
     if min(len(source.points), len(target.points)) < EXACT_TARGET or fine > pair.edge / 2:
         return polished
-    s, t = pair.both(lambda cloud: voxel_downsample(cloud.points, fine))
+    s, t = pair.both(lambda cloud: cloud.thinned(fine))
     some = sample(s, GICP_SOURCE, np.random.default_rng(pair.seed))
     return by_gicp(GicpCloud(some, fine, pair.threads), GicpCloud(t, fine, pair.threads), T, fine)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmr_cli.geometry.voxels import occupied_voxels, voxel_downsample, voxel_keys
+from fmr_cli.geometry.voxels import Voxels, occupied_voxels, voxel_downsample, voxel_keys
 
 
 def test_equal_keys_are_equal_voxels_in_the_order_of_their_indices() -> None:
@@ -36,3 +36,13 @@ def test_the_occupied_voxels_are_those_of_their_keys(far: float) -> None:
     expected = len(np.unique(np.floor((points - points.min(0)) / 0.05), axis=0))
     assert occupied_voxels(given, 0.05) == expected
     assert np.array_equal(given, points)
+
+
+def test_grids_of_doubled_edges_are_those_of_the_points() -> None:
+    points = np.random.default_rng(0).uniform(-3, 3, (20_000, 3))
+    points[:5000, 0] = 0.3  # a plane on the border of voxels, where a mean may lie on either side
+    grid = Voxels.of(points, 0.1)
+    for edge in (0.1, 0.2, 0.4):
+        assert grid.edge == edge
+        np.testing.assert_allclose(grid.means, voxel_downsample(points, edge), atol=1e-12)
+        grid = grid.doubled()
