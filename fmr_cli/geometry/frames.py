@@ -21,7 +21,8 @@ class Frame:
 
     def enter(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) of the outer coordinates in this frame."""
-        return (points - self.origin) / self.unit
+        local = points - self.origin
+        return local if self.unit == 1.0 else local / self.unit
 
     def leave(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) of this frame in the outer coordinates."""

@@ -65,9 +65,11 @@ def far(points: np.ndarray) -> np.ndarray:
     some = points[:: max(len(points) // SAMPLE, 1)]
     middle = np.median(some, axis=0)
     limit = FAR * np.quantile(np.abs(some - middle).max(1), 0.9)
-    distance = np.maximum.reduce([np.abs(x - c) for x, c in zip(points.T, middle, strict=True)])
-    stray = distance > limit
-    return stray if limit > 0 and stray.sum() <= max(FEW * len(points), 1) else np.zeros(len(points), bool)
+    none = np.zeros(len(points), bool)
+    if max(max(x.max() - c, c - x.min()) for x, c in zip(points.T, middle, strict=True)) <= limit:
+        return none  # as most clouds, without an array of their size
+    stray = np.maximum.reduce([np.abs(x - c) for x, c in zip(points.T, middle, strict=True)]) > limit
+    return stray if limit > 0 and stray.sum() <= max(FEW * len(points), 1) else none
 
 
 def on_a_shell(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
