@@ -51,7 +51,8 @@ def alike_at(T: np.ndarray, point: np.ndarray, reach: float) -> np.ndarray:
     R = T[:, :3, :3].reshape(-1, 9)
     moved = T[:, :3, :3] @ point + T[:, :3, 3]
     off = moved[:, None] - moved
-    return (R @ R.T >= 1 + 2 * np.cos(APART)) & (np.einsum("ijk,ijk->ij", off, off) <= reach**2)
+    trace = R @ R.T  # of the rotations between them: 1 + 2 cos of their angle
+    return (np.arccos(np.clip((trace - 1) / 2, -1, 1)) <= APART) & (np.einsum("ijk,ijk->ij", off, off) <= reach**2)
 
 
 def poses_from_seeds(

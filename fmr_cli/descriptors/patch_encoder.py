@@ -102,8 +102,10 @@ class LocalEncoder:
 
     @cached_property
     def late(self) -> list[np.ndarray]:
-        """The biases of the points' MLP as ``pooled`` adds them, late: relu(z + b) = max(z, -b) + b, and that b goes
-        through the next layer's matrix into its bias. One pass over an activation in place of two."""
+        """The biases of the points' MLP as ``pooled`` adds them: one pass over an activation in place of two.
+
+        relu(z + b) = max(z, -b) + b, and that b goes through the next layer's matrix into its bias.
+        """
         late = [self.point[0][1]]
         for weight, bias in self.point[1:]:
             late.append(bias + weight @ late[-1])

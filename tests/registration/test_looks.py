@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from fmr_cli import PointCloud, align
-from fmr_cli.registration import hypotheses, looks
+from fmr_cli.registration import hypotheses, looks, pipeline, refinement
 from fmr_cli.registration.confidence import ALIGNED, Judge, doubts
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.pipeline import prepare
 from fmr_cli.registration.prepared import Prepared
+from fmr_cli.registration.result import Stopwatch
 
 Scans = tuple[np.ndarray, np.ndarray]
 
@@ -74,3 +75,52 @@ def test_a_hopeless_pair_gets_no_fine_look_unless_its_points_are_few(
     source, target = (PointCloud(rng.uniform(-1, 1, (points, 3))) for _ in range(2))
     assert align(source, target, hints=False).status == "uncertain"
     assert bool(asked) == looked_at
+
+
+def test_what_a_look_on_the_same_voxels_found_is_taken_over_with_its_own_matches(
+    scans: tuple[Prepared, Prepared],
+) -> None:
+    first, closer = looked(scans, looks.FIRST, 0.4), looked(scans, looks.CLOSER, 0.4)
+    judge = Judge(closer.pair)
+    judge.adopt(first.best)
+    assert judge.best.evidence == closer.best.evidence
+    assert judge.best.evidence.votes > first.best.evidence.votes
+
+
+@pytest.mark.parametrize(("confidence", "known"), [(0.04, 0), (0.06, 1)])
+def test_wide_voxels_are_asked_about_poses_that_are_not_hopeless(
+    scans: tuple[Prepared, Prepared], confidence: float, known: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judge, formers = looked(scans, looks.FIRST, confidence), []
+
+    def look(pair: object, time: object, former: Judge | None = None) -> Judge:
+        formers.append(former)
+        return judge
+
+    monkeypatch.setattr(looks, "coarse_look", look)
+    looks.at_once(*scans, Options(), 1, Stopwatch())
+    assert [former is judge for former in formers] == [False, True, bool(known)]
+
+
+@pytest.mark.parametrize(("start", "polished"), [("features", 0), ("given", 1)])
+def test_a_pose_without_hope_is_polished_only_where_it_was_given(
+    scans: tuple[Prepared, Prepared], start: str, polished: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judge, asked = looked(scans, looks.CLOSER, 0.04), []
+    judge.candidates = [replace(judge.best, start=start)]
+    monkeypatch.setattr(pipeline, "look", lambda *_: judge)
+    monkeypatch.setattr(refinement, "by_geometry", lambda pair, T: asked.append(T) or T)
+    assert pipeline.align(*scans, hints=False).status == "uncertain"
+    assert len(asked) == polished
+
+
+def test_a_score_is_told_as_none_only_where_it_is_below_what_is_asked_for(scans: tuple[Prepared, Prepared]) -> None:
+    pair, T = make_pair(*scans, Options(), 1, *looks.FIRST), np.eye(4)
+    told = 0
+    for shift in np.linspace(0, 2, 30):
+        T[0, 3] = shift
+        given = pair.overlap_score(T, floor=0.3)
+        plain = pair.overlap_score(T)
+        assert given == plain or (given == 0 and plain < 0.3)
+        told += given == 0
+    assert 0 < told < 30
