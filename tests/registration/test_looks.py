@@ -109,7 +109,7 @@ def test_a_pose_without_hope_is_polished_only_where_it_was_given(
     judge, asked = looked(scans, looks.CLOSER, 0.04), []
     judge.candidates = [replace(judge.best, start=start)]
     monkeypatch.setattr(pipeline, "look", lambda *_: judge)
-    monkeypatch.setattr(refinement, "by_geometry", lambda pair, T: asked.append(T) or T)
+    monkeypatch.setattr(refinement, "by_geometry", lambda pair, T: asked.append(T) or refinement.Polished(T))
     assert pipeline.align(*scans, hints=False).status == "uncertain"
     assert len(asked) == polished
 
