@@ -109,9 +109,9 @@ def of_clouds(pairs: list[tuple[str, Overlapping]], kind: str) -> list[CheckPair
 
 
 def compare(
-    pairs: list[CheckPair], before: Path | None, after: Path, seconds: float | None, show: Callable[[int, int], None]
+    pairs: list[CheckPair], before: Path | None, after: Path, seconds: float, show: Callable[[int, int], None]
 ) -> list[Checked]:
-    """Registers the pairs by both models, kinds and bands in turn, as many as ``seconds`` allow (None: all)."""
+    """Registers the pairs by both models, kinds and bands in turn, as many as ``seconds`` allow."""
     begin = time.monotonic()
     ordered, a, b = in_turn(pairs), model(before), model(after)
     same = a.local.key == b.local.key and not b.weights.sites and all(
@@ -120,7 +120,7 @@ def compare(
 
     def one(item: tuple[int, CheckPair]) -> Checked | None:
         number, pair = item
-        if seconds is not None and number >= LEAST and time.monotonic() - begin > seconds:
+        if number >= LEAST and time.monotonic() - begin > seconds:
             return None
         try:
             ends = pair.ends()

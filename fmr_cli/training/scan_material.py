@@ -186,6 +186,10 @@ class ScanMaterial:
         parts = [{n: np.array(T) for n, T in part.items() if n not in self.held_out} for part in found]
         return [part for part in parts if part]
 
+    def held_out_scans(self) -> list[Part]:
+        """Those of the last round, each as a part of its own."""
+        return [{n: np.eye(4)} for n in (self.rounds[-1].scans if self.rounds else []) if n in self.held_out]
+
     def held_out_pairs(self) -> list[Placed]:
         """The pairs with a scan that is held out."""
         placed = {p.ends: p for found in self.rounds for p in found.pairs if not self.trains(p)}

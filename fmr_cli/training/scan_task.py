@@ -30,14 +30,14 @@ from fmr_cli.training.run_folder import MODEL, held
 from fmr_cli.training.scan_material import MADE_UP, SCANS, SHARES, ScanMaterial
 from fmr_cli.training.scan_views import inlier_ratio, made_up_pair
 from fmr_cli.training.self_registration import Placed
-from fmr_cli.training.sites import Sites
+from fmr_cli.training.sites import Part, Sites
 from fmr_cli.training.task import Files, Scores, Show, Task, ramped_cosine
 
 CURRENT = "current.safetensors"
 RIGHT = "right matches"  # column of metrics.csv: the share of the matches of two scans that are right
 FORGOTTEN = 0.15  # of the right matches on made-up scans, that may be lost
 CHECK_SHARE = 0.3  # of the minutes, that making sites and the last test may take
-SITES_SHARE = 0.5  # of these, that making sites may
+SITES_SHARE, COMPARED_SHARE = 0.4, 0.9  # of these, after which no more scans are sought on sites, or pairs registered
 ROUNDS_SHARE = 0.3  # of the time that is left after the first round, that further ones may take
 RAMP = 30  # steps over which the rate rises: Adam knows its second moments by then, and a run may be short
 
@@ -200,13 +200,29 @@ class ScanTask(Task):
         return CHECK_SHARE * 60 * minutes if self.recipe.checked else 0.0
 
     def check(self, files: Files, seconds: float | None, show: Show) -> dict[str, Any] | None:
-        """Held-out pairs registered by ``align`` before and after; what has got worse is not kept."""
-        begin, said = time.monotonic(), []
-        if self.recipe.site_points:
-            said = self.keep_sites(files, None if seconds is None else SITES_SHARE * seconds, show)
-        if not self.recipe.checked:
+        """What was seen of sites goes into the model; held-out pairs through ``align``, before and after.
+
+        What has got worse is not kept. Once all is measured, what held-out scans show of the sites is kept as well.
+        """
+        begin, path = time.monotonic(), files.path / MODEL
+
+        def left(share: float) -> float:
+            return float("inf") if seconds is None else share * seconds - (time.monotonic() - begin)
+
+        makes = Sites(self.material.store, path, lambda: left(SITES_SHARE) < 0, show)
+        sites = makes.learn(self.material.parts()) if self.recipe.site_points else []
+        said = self.keep_sites(files, makes, sites)
+        checked = self.compared(files, left(COMPARED_SHARE), show) if self.recipe.checked else None
+        if sites and model(path).weights.sites:
+            makes = replace(makes, late=lambda: left(1.0) < 0)
+            sites, _ = makes.grown(sites, self.material.held_out_scans())
+            said = self.keep_sites(files, makes, sites)
+        if checked is None:
             return {"said": said, "rows": [], "kept": True} if said else None
-        seconds = None if seconds is None else seconds - (time.monotonic() - begin)
+        return checked | {"said": [*said, *checked["said"]]}
+
+    def compared(self, files: Files, seconds: float, show: Show) -> dict[str, Any]:
+        """Held-out pairs registered by ``align`` before and after; what has got worse is not kept."""
         third, material = self.recipe.checked // 3, self.material
         placed = material.held_out_pairs()
         pairs = check.of_scans(placed, material.store, self.recipe.checked - third, self.recipe.seed)
@@ -218,17 +234,13 @@ class ScanTask(Task):
         decision = check.decide(checked, files.path / MODEL, self.start)
         if decision.replaced is not None:
             files.write(MODEL, decision.replaced)
-        return {"said": [*said, *decision.said], "rows": check.rows(checked), "kept": decision.kept}
+        return {"said": decision.said, "rows": check.rows(checked), "kept": decision.kept}
 
-    def keep_sites(self, files: Files, seconds: float | None, show: Show) -> list[str]:
-        """Puts what was seen of sites into the model file, in so many seconds; says so."""
-        begin, path = time.monotonic(), files.path / MODEL
-        makes = Sites(
-            self.material.store, path, lambda: seconds is not None and time.monotonic() - begin > seconds, show
-        )
-        sites = makes.learn(self.material.parts())
+    def keep_sites(self, files: Files, makes: Sites, sites: list[Part]) -> list[str]:
+        """Puts what scans show of sites into the model file; says so."""
         if not sites:
             return []
+        path = files.path / MODEL
         points = [makes.points(site, self.recipe.site_points // len(sites)) for site in sites]
         files.write(MODEL, weights_bytes(replace(model(path).weights, sites=points)))
         scans, several = sum(map(len, sites)), f"{len(sites)} sites" if len(sites) > 1 else "a site"

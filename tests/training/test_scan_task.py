@@ -325,3 +325,24 @@ def test_a_timed_run_registers_no_more_often_than_leaves_time_for_steps(files, f
         assert task.fit_renewals(seconds, each=60) == {"rounds": rounds}
         assert task.renewals() == rounds - 1
         assert task.material.round_at(99, 100) == rounds - 1
+
+
+@pytest.mark.slow
+def test_the_file_keeps_the_site_of_all_scans_also_of_those_that_were_held_out(tmp_path, files, found):
+    scans, poses = files
+    placed = {n: np.linalg.inv(T).tolist() for n, T in enumerate(poses)}
+    known = replace(found, scans=list(range(5)), parts=[placed])
+    for points in (20_000, 0):
+        folder = tmp_path / str(points)
+        folder.mkdir()
+        (folder / ROUNDS).write_text(json.dumps([known.plain()]))
+        run = trainer(files, folder, rounds=1, steps=2, site_points=points)
+        notes = finish(run)
+        kept = model(folder / "model.safetensors").weights.sites
+        assert len(kept) == (points > 0)
+        assert [note for note in notes if "the model keeps" in note] == (
+            [f"the model keeps {len(kept[0]):,} points of a site that 5 scans show"] if kept else []
+        )
+        assert sum(map(len, kept)) <= points
+        assert run.task.material.held_out  # of which the site shows what the others do not
+    assert read_rounds(folder / ROUNDS)[0].parts == [placed]
