@@ -88,13 +88,13 @@ def align(
 
 
 def by_way_of_a_site(source: Prepared, target: Prepared, options: Options, time: Stopwatch) -> Registration | None:
-    """The pose of two scans of a site that the model knows, if both are surely found there; see ``sites``."""
+    """The pose of two scans of a site that the model knows, if both are found there; see ``sites``."""
     if not sites.asked(options):
         return None
     with one_blas_thread(), time.stage("site"):
-        source_there = sites.surest(on_sites(source, options))
-        target_there = sites.surest(on_sites(target, options)) if source_there else None
-        if not (source_there and target_there) or source_there.site is not target_there.site:
+        source_there = sites.likeliest(on_sites(source, options))
+        target_there = sites.likeliest(on_sites(target, options)) if source_there else None
+        if not (source_there and target_there):
             return None
         return sites.composed(source, target, options, source_there, target_there)
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from fmr_cli.geometry.frames import enter_frames
 from fmr_cli.geometry.se3 import adjoint
-from fmr_cli.registration.confidence import Judge, among
-from fmr_cli.registration.looks import FINE, SURE
+from fmr_cli.registration.confidence import ALIGNED, Judge, among
+from fmr_cli.registration.looks import FINE
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.prepared import Prepared
@@ -42,36 +42,34 @@ class Placement:
     found: Registration
 
 
-def surest(placements: Sequence[Placement]) -> Placement | None:
-    """The one of a scan's placements, each on another site, that is surely right; None if there is none.
+def likeliest(placements: Sequence[Placement]) -> Placement | None:
+    """The one of a scan's placements, each on another site, that is most likely right, if it is ``aligned``.
 
-    It has what the others leave of its confidence, as a scan is on one site at most. Two placements make a pose: each
-    has to be surer than a pose is to be ``aligned``.
+    It has what the others leave of its confidence, as a scan is on one site at most.
     """
     if not placements:
         return None
     best, *others = sorted(placements, key=lambda placement: -placement.found.confidence)
     confidence = among(best.found.confidence, [other.found.confidence for other in others])
-    sure = best.found.status == "aligned" and confidence >= SURE
-    return replace(best, found=replace(best.found, confidence=confidence)) if sure else None
+    return replace(best, found=replace(best.found, confidence=confidence)) if best.found.status == "aligned" else None
 
 
 def composed(
     source: Prepared, target: Prepared, options: Options, source_there: Placement, target_there: Placement
 ) -> Registration | None:
-    """The pose of two scans that are on one site, and what their surfaces say of it; None if not allowed.
+    """The pose of two scans that are on one site, and what their surfaces say of it; None if it is doubtful.
 
-    The covariance is that of both placements, which are independent; what the site itself is off between the two places
-    is not in it.
+    It is right where both placements are: its confidence is the product of theirs. So is its covariance their sum; what
+    the site itself is off between the two places is not in it.
     """
     there, T_target_site = source_there.found, np.linalg.inv(target_there.found.T_target_source)
+    confidence = there.confidence * target_there.found.confidence
     pair = make_pair(source, target, options, 1, *FINE)
     T_target_source = pair.enter_centred(T_target_site @ there.T_target_source)
-    if not pair.allowed(T_target_source):
+    if confidence < ALIGNED or source_there.site is not target_there.site or not pair.allowed(T_target_source):
         return None
     judge = Judge(pair)
     judge.consider(T_target_source, START, [])
-    confidence = there.confidence * target_there.found.confidence
     found = describe(pair, replace(judge.best, confidence=confidence), [], source, 1.0, options)
     A = adjoint(enter_frames(T_target_site, target_there.site.frame, target.frame))
     covariance = A @ (there.covariance + target_there.found.covariance) @ A.T

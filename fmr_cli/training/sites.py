@@ -20,10 +20,11 @@ from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.multiway.store import Store
 from fmr_cli.registration import Options, prepare
+from fmr_cli.registration.looks import SURE
 from fmr_cli.registration.pair import DISTINCT_DEGREES, DISTINCT_EDGES
 from fmr_cli.registration.pipeline import on_site
 from fmr_cli.registration.prepared import Prepared
-from fmr_cli.registration.sites import surest
+from fmr_cli.registration.sites import likeliest
 from fmr_cli.training.self_registration import side_by_side
 from fmr_cli.training.task import Show
 
@@ -130,8 +131,8 @@ class Sites:
         """T_site_scan, files' coordinates, of a scan or a part that is found on a site, if surely and in time."""
         if self.late():
             return None
-        sure = surest(on_site(scan, site, Options(model=self.model, seed=self.store.seed)))
-        return sure.found.T_target_source if sure else None
+        there = likeliest(on_site(scan, site, Options(model=self.model, seed=self.store.seed)))
+        return there.found.T_target_source if there and there.found.confidence >= SURE else None
 
     def same(self, number: int, a: np.ndarray, b: np.ndarray) -> bool:
         """Whether two poses of a scan are one."""

@@ -14,6 +14,7 @@ from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.errors import ModelError
 from fmr_cli.io.weights import read_weights, weights_bytes
 from fmr_cli.registration import Options, align, prepare, sites
+from fmr_cli.registration.confidence import ALIGNED
 from fmr_cli.registration.models import model
 from fmr_cli.registration.pipeline import on_site
 from fmr_cli.registration.prepared import Prepared
@@ -59,7 +60,7 @@ def test_two_scans_that_look_away_from_each_other_have_a_pose_by_way_of_the_site
     off = np.linalg.norm(transform_points(found.T_target_source, here) - transform_points(truth, here))
     assert off < 0.05
     assert found.overlap < 0.2
-    assert sites.SURE**2 <= found.confidence < 1
+    assert ALIGNED <= found.confidence < 1
     assert (np.linalg.eigvalsh(found.covariance) > 0).all()  # every direction is determined, by the site
     assert found.undetermined == found.reasons == []
     assert "site" in found.seconds
@@ -69,7 +70,7 @@ def test_its_covariance_is_that_of_both_scans_on_the_site(walk, pair):
     """Each is surer of its own place than of the two places together; a turn there shifts what lies far off."""
     source, target = (prepare(cloud) for cloud in pair[:2])
     site = prepare(PointCloud(walk[0]))
-    there = [sites.surest(on_site(scan, site, Options())) for scan in (source, target)]
+    there = [sites.likeliest(on_site(scan, site, Options())) for scan in (source, target)]
     assert all(there)
     found = sites.composed(source, target, Options(), *there)
     turns = [np.trace(x.covariance[:3, :3]) for x in (there[0].found, there[1].found, found)]

@@ -329,7 +329,7 @@ def test_a_timed_run_registers_no_more_often_than_leaves_time_for_steps(files, f
 
 @pytest.mark.slow
 def test_the_file_keeps_the_site_of_all_scans_also_of_those_that_were_held_out(tmp_path, files, found):
-    scans, poses = files
+    poses = files[1]
     placed = {n: np.linalg.inv(T).tolist() for n, T in enumerate(poses)}
     known = replace(found, scans=list(range(5)), parts=[placed])
     for points in (20_000, 0):
