@@ -110,7 +110,11 @@ def on_sites(scan: Prepared, options: Options) -> list[sites.Placement]:
 def on_site(scan: Prepared, site: Prepared, options: Options) -> list[sites.Placement]:
     """Where a scan is found on a site; nowhere if it cannot be registered with that."""
     with suppress(RegistrationError):  # too small beside the site, say
-        return [sites.Placement(site, as_they_are(scan, site, sites.there(options), 1, False, Stopwatch()))]
+        given = sites.there(options)
+        found = as_they_are(scan, site, given, 1, False, Stopwatch())
+        if found.status == "aligned" and not mirror.unlikely(found):
+            found = mirror.weighed(found, mirror_look(scan, site, given, 1, found))
+        return [sites.Placement(site, found)]
     return []
 
 
