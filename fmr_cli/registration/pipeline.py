@@ -67,10 +67,11 @@ def align(
     check_systems(prepared, target)
     found = as_they_are(prepared, target, options, threads, check, time)
     aligned = found.status == "aligned"
-    if not aligned and (known := by_way_of_a_site(prepared, target, options, time)):
-        return replace(known, warnings=found.warnings, seconds=time.seconds)
     if aligned and mirror.unlikely(found):
         return found
+    if known := by_way_of_a_site(prepared, target, options, time):
+        believed = sites.believed(prepared, found, known)
+        return replace(believed, warnings=found.warnings, seconds=time.seconds)
     fits = None
     if aligned or (hints and not options.allow_mirror):
         fits = mirror_look(prepared, target, options, threads, found if aligned else None)

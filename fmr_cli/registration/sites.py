@@ -11,16 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fmr_cli.cloud import angle_degrees, transform_points
 from fmr_cli.geometry.frames import enter_frames
 from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.registration.confidence import ALIGNED, Judge, among
 from fmr_cli.registration.looks import FINE
 from fmr_cli.registration.options import Options
-from fmr_cli.registration.pair import make_pair
+from fmr_cli.registration.pair import DISTINCT_DEGREES, DISTINCT_EDGES, make_pair
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration, describe
 
 START = "site"  # of poses that come from there
+EITHER = 0.5  # the most that is left of a site's pose where the scans alone are sure of another one
+APART = "registered with each other alone, the scans have another pose (confidence {:.2f}) than on a site that is known"
 
 
 def asked(options: Options) -> bool:
@@ -32,6 +35,12 @@ def asked(options: Options) -> bool:
 def there(options: Options) -> Options:
     """The options by which one scan is found on a site: what bounds the pose of the two bounds no other."""
     return replace(options, voxel_size=None, max_angle=None, max_shift=None, allow_mirror=False)
+
+
+def same(scan: Prepared, a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two poses (4, 4) of a scan, files' coordinates, are one but for what a refinement moves."""
+    off = np.linalg.norm(transform_points(a, scan.centre[None]) - transform_points(b, scan.centre[None]))
+    return bool(off < DISTINCT_EDGES * scan.edge and angle_degrees(np.linalg.inv(a) @ b) < DISTINCT_DEGREES)
 
 
 @dataclass(frozen=True)
@@ -81,3 +90,18 @@ def composed(
         undetermined=[],
         reasons=[],
     )
+
+
+def believed(source: Prepared, alone: Registration, known: Registration) -> Registration:
+    """Of the pose that two scans have alone, and of the one by way of a site, the one to be given.
+
+    Where both are ``aligned`` and one, the one that is more exact by its covariance. Where they are two, the site's, as
+    each scan explains more of it than the two explain of each other; but one of them is wrong.
+    """
+    if alone.status != "aligned":
+        return known
+    if same(source, alone.T_target_source, known.T_target_source):
+        best = max(alone, known, key=lambda found: float(np.linalg.slogdet(found.information)[1]))
+        return replace(best, confidence=max(alone.confidence, known.confidence))
+    reasons = [APART.format(alone.confidence), *known.reasons]
+    return replace(known, status="uncertain", confidence=min(known.confidence, EITHER), reasons=reasons)

@@ -16,15 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
+from fmr_cli.cloud import PointCloud, transform_points
 from fmr_cli.geometry.voxels import voxel_downsample
 from fmr_cli.multiway.store import Store
 from fmr_cli.registration import Options, prepare
 from fmr_cli.registration.looks import SURE
-from fmr_cli.registration.pair import DISTINCT_DEGREES, DISTINCT_EDGES
 from fmr_cli.registration.pipeline import on_site
 from fmr_cli.registration.prepared import Prepared
-from fmr_cli.registration.sites import likeliest
+from fmr_cli.registration.sites import likeliest, same
 from fmr_cli.training.self_registration import side_by_side
 from fmr_cli.training.task import Show
 
@@ -104,7 +103,7 @@ class Sites:
 
         again = side_by_side(found, numbers, partial(self.show, "sites: each scan by the others"))
         there = {n: T for n, T in zip(numbers, again, strict=True) if T is not None}
-        stay = {n: part[n] for n, T in there.items() if self.same(n, T, part[n])}
+        stay = {n: part[n] for n, T in there.items() if same(self.store.prepared(n), T, part[n])}
         return stay, {n: T for n, T in there.items() if n not in stay}
 
     def grown(self, sites: list[Part], rest: list[Part]) -> tuple[list[Part], list[Part]]:
@@ -133,12 +132,6 @@ class Sites:
             return None
         there = likeliest(on_site(scan, site, Options(model=self.model, seed=self.store.seed)))
         return there.found.T_target_source if there and there.found.confidence >= SURE else None
-
-    def same(self, number: int, a: np.ndarray, b: np.ndarray) -> bool:
-        """Whether two poses of a scan are one."""
-        scan = self.store.prepared(number)
-        off = np.linalg.norm(transform_points(a, scan.centre[None]) - transform_points(b, scan.centre[None]))
-        return bool(off < DISTINCT_EDGES * scan.edge and angle_degrees(np.linalg.inv(a) @ b) < DISTINCT_DEGREES)
 
     def merged(self, scans: Part) -> Prepared:
         """What scans show together, made ready."""

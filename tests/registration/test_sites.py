@@ -121,3 +121,23 @@ def test_a_file_keeps_its_sites_and_an_odd_one_is_one_line(tmp_path, walk):
     path = knowing(tmp_path / "odd.safetensors", walk[0][:, :2])
     with pytest.raises(ModelError, match="the weights do not fit"):
         read_weights(path)
+
+
+def test_of_two_poses_that_are_one_the_more_exact_is_given_and_of_two_none_is_aligned(walk, pair):
+    source, target = (prepare(cloud) for cloud in pair[:2])
+    site = prepare(PointCloud(walk[0]))
+    there = [sites.likeliest(on_site(scan, site, Options())) for scan in (source, target)]
+    known = sites.composed(source, target, Options(), *there)
+    assert known is not None
+    near, far = known.T_target_source.copy(), known.T_target_source.copy()
+    near[:3, 3] += 0.01
+    far[:3, 3] += 1.0
+    alone = replace(known, T_target_source=near, start="features", confidence=0.999)
+    exact, rough = (replace(alone, information=factor * known.information) for factor in (2.0, 0.5))
+    assert sites.believed(source, exact, known).start == "features"
+    found = sites.believed(source, rough, known)
+    assert (found.start, found.confidence) == (sites.START, 0.999)
+    assert sites.believed(source, replace(alone, status="uncertain"), known) is known
+    doubted = sites.believed(source, replace(alone, T_target_source=far), known)
+    assert (doubted.status, doubted.start, doubted.confidence) == ("uncertain", sites.START, sites.EITHER)
+    assert "another pose (confidence 1.00)" in doubted.reasons[0]
