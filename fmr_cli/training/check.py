@@ -185,7 +185,8 @@ def decide(checked: list[Checked], path: Path, start: Path | None) -> Decision:
         # What is seen of sites is no weight, and stays unless it may be what deceives.
         sites = model(start).weights.sites if more_wrong(checked) else model(path).weights.sites
         kept = replace(model(start).weights, sites=sites)
-        return Decision(False, weights_bytes(kept), [f"not kept: {why}; {path} holds the start"])
+        also = ", and what was seen of sites" if sites else ""
+        return Decision(False, weights_bytes(kept), [f"not kept: {why}; {path} holds the start{also}"])
     return Decision(True, replaced, said)
 
 
