@@ -105,8 +105,10 @@ def verdict(trainer: Trainer, stopped: bool) -> str:
     if not check["kept"]:
         return f"{how}{check['said'][-1]}"
     if check["rows"]:
-        before, after = (sum(row[when]["aligned"] for row in check["rows"]) for when in ("before", "after"))
-        how += f"of {sum(row['pairs'] for row in check['rows'])} held-out pairs {before} were aligned, {after} are; "
+        counts = ([row[when] for row in check["rows"]] for when in ("before", "after"))
+        before, after = (sum(row["aligned"] - row["wrong"] for row in rows) for rows in counts)
+        pairs = sum(row["pairs"] for row in check["rows"])
+        how += f"of {pairs} held-out pairs {before} were right and aligned, {after} are; "
     if progress.best == 0:
         return f"{how}training made the encoders no better than their start, which {where} holds"
     before, after = trainer.quality(0)[0], trainer.quality(progress.best)[0]
