@@ -17,7 +17,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration.confidence import Judge
-from fmr_cli.registration.looks import COARSE, DISPUTED, FINE, HOPELESS, Look, coarse_look, further, surest
+from fmr_cli.registration.looks import COARSE, DISPUTED, FINE, HOPELESS, Look, coarse_look, further, surest, taken_up
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import make_pair
 from fmr_cli.registration.pipeline import one_blas_thread
@@ -84,8 +84,8 @@ def all_looks(source: Prepared, target: Prepared) -> dict[Look, Judge]:
     time, judges = Stopwatch(), dict[Look, Judge]()
     for look in COARSE:
         with suppress(RegistrationError):  # too few voxels of that size
-            pair, former = make_pair(source, target, Options(), 1, *look), surest(list(judges.values()))
-            judges[look] = coarse_look(pair, time, former)
+            pair = make_pair(source, target, Options(), 1, *look)
+            judges[look] = coarse_look(pair, time, taken_up(look, list(judges.values())))
     return judges | {FINE: further(source, target, Options(), 1, time, surest(list(judges.values())))}
 
 

@@ -65,9 +65,8 @@ def at_once(
         looks = [WIDER] if options.voxel_size else [FIRST, CLOSER, WIDER][len(judges) :]
     for look in looks:
         with suppress(RegistrationError):  # too few voxels of that size
-            # On other voxels poses are refined anew: those without hope are not worth it.
-            hopeful = [j for j in judges if look != WIDER or j.sure(HOPELESS)]
-            judges.append(coarse_look(make_pair(source, target, options, threads, *look), time, surest(hopeful)))
+            pair = make_pair(source, target, options, threads, *look)
+            judges.append(coarse_look(pair, time, taken_up(look, judges)))
             if judges[-1].sure(COARSE[look]):
                 return finer(judges[-1])
     coarse = surest(judges)
@@ -82,6 +81,14 @@ def at_once(
 def surest(judges: list[Judge]) -> Judge | None:
     """The look that is surest of its best pose: the next one goes on from its poses. None where none has any."""
     return max((j for j in judges if j.candidates), key=lambda j: j.best.confidence, default=None)
+
+
+def taken_up(look: Look, judges: list[Judge]) -> Judge | None:
+    """Whose poses a coarse look goes on from: the surest look's before it; on WIDER voxels not if they have no hope.
+
+    There they would have to be refined anew, which those are not worth.
+    """
+    return surest([judge for judge in judges if look != WIDER or judge.sure(HOPELESS)])
 
 
 def disputed(coarse: Judge, fine: Judge) -> Judge:

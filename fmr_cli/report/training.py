@@ -110,7 +110,7 @@ def verdict(trainer: Trainer, stopped: bool) -> str:
         pairs = sum(row["pairs"] for row in check["rows"])
         how += f"of {pairs} held-out pairs {before} were right and aligned, {after} are; "
     if progress.best == 0:
-        return f"{how}training made the encoders no better than their start, which {where} holds"
+        return f"{how}training made the encoders no better; {where} holds the start's"
     before, after = trainer.quality(0)[0], trainer.quality(progress.best)[0]
     more = task.gain(progress.scores["0"], progress.scores[str(progress.best)])
     return (
