@@ -29,7 +29,8 @@ from fmr_cli.training.task import Show
 
 FEWEST = 3  # scans of a site that is kept: of two, one may stand wrong, and nothing says so
 # Of the scans of a site that are surely found by the others, those found where they don't stand: in places with rooms
-# that look alike one in ten; of a street and an object none of 28 and of 20 (`python -m benchmarks.training`).
+# that look alike 2 of 21; of a street and an object none of 28 and of 20 (the places of `benchmarks.training`, by a
+# script that is not in the project).
 MISTAKEN = 0.05
 DETAIL = 3.0  # points of a site across the voxel edge that suits its scans: with fewer, it would need larger voxels
 COARSER = 1.26  # times the grid's edge, where a site has too many points: a surface keeps two thirds of them
