@@ -22,6 +22,9 @@ from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration, describe
 
 START = "site"  # of poses that come from there
+# Times smaller, that a site's deviations are on the mean, for its pose to take the place of the scans' own: what the
+# site itself is off is not in them.
+MORE_EXACT = 2.0
 EITHER = 0.5  # the most that is left of a site's pose where the scans alone are sure of another one
 APART = "registered with each other alone, the scans have another pose (confidence {:.2f}) than on a site that is known"
 
@@ -95,13 +98,14 @@ def composed(
 def believed(source: Prepared, alone: Registration, known: Registration) -> Registration:
     """Of the pose that two scans have alone, and of the one by way of a site, the one to be given.
 
-    Where both are ``aligned`` and one, the one that is more exact by its covariance. Where they are two, the site's, as
-    each scan explains more of it than the two explain of each other; but one of them is wrong.
+    Where both are ``aligned`` and one, the scans' own, unless the site's is far more exact by its covariance. Where they
+    are two, the site's, as each scan explains more of it than the two explain of each other; but one of them is wrong.
     """
     if alone.status != "aligned":
         return known
     if same(source, alone.T_target_source, known.T_target_source):
-        best = max(alone, known, key=lambda found: float(np.linalg.slogdet(found.information)[1]))
+        gain = np.linalg.slogdet(known.information)[1] - np.linalg.slogdet(alone.information)[1]
+        best = known if gain > 12 * np.log(MORE_EXACT) else alone  # six directions, and squares
         return replace(best, confidence=max(alone.confidence, known.confidence))
     reasons = [APART.format(alone.confidence), *known.reasons]
     return replace(known, status="uncertain", confidence=min(known.confidence, EITHER), reasons=reasons)
