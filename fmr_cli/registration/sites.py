@@ -98,8 +98,8 @@ def composed(
 def believed(source: Prepared, alone: Registration, known: Registration) -> Registration:
     """Of the pose that two scans have alone, and of the one by way of a site, the one to be given.
 
-    Where both are ``aligned`` and one, the scans' own, unless the site's is far more exact by its covariance. Where they
-    are two, the site's, as each scan explains more of it than the two explain of each other; but one of them is wrong.
+    Where both are ``aligned`` and one, the scans' own, unless the site's is far more exact by its covariance. Where
+    they are two, the site's, as each scan explains more of it than the two explain of each other; but one is wrong.
     """
     if alone.status != "aligned":
         return known
