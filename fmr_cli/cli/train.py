@@ -59,8 +59,8 @@ def train_command(
 
     The scans are registered with each other, in rounds; where two show one place the local features learn to match,
     and the encoder of whole clouds goes on as well. What they show of a site is kept too, for scans of it that hardly
-    overlap. At the end, held-out pairs are registered before and after, and
-    what has got worse is not kept. A recipe may be of another kind: "global", or "local" on made-up scans alone.
+    overlap. At the end, held-out pairs are registered before and after, and what has got worse is not kept. A recipe
+    may be of another kind: "global", or "local" on made-up scans alone.
     The folder of the run gets model.safetensors (for `--model` of align, batch, sequence, multiway), README.md (what
     it was made from, held-out figures), training.png, recipe.toml, metrics.csv, registered.json (the poses found) and
     state.safetensors (for --resume).

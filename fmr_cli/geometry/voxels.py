@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,17 +65,11 @@ class Voxels:
 
 def voxel_ranks(points: np.ndarray, edge: float) -> np.ndarray:
     """(N,) which voxel each of points (N, 3) lies in, the occupied ones counted from 0 by z, then y, then x."""
-    key, cell, cells, bits = np.zeros(len(points)), np.empty(len(points)), 1, len(points).bit_length()
-    for c in points.T[::-1]:  # the voxel's number in the points' box, exact below 2^53
-        np.floor(np.multiply(c, 1 / edge, out=cell), out=cell)
-        low = cell.min()
-        count = int(cell.max() - low) + 1
-        cells *= count
-        if cells >= 1 << min(53, 63 - bits):  # a box of so many voxels is empty but for a few
-            return np.unique(np.floor(points[:, ::-1] * (1 / edge)), axis=0, return_inverse=True)[1].reshape(-1)
-        key *= count
-        key += cell
-        key -= low
+    cell, bits = np.empty(len(points)), len(points).bit_length()
+    indices = (np.floor(np.multiply(c, 1 / edge, out=cell), out=cell) for c in points.T[::-1])
+    key, cells = numbers_in_box(indices, len(points))
+    if cells >= 1 << min(53, 63 - bits):  # a box of so many voxels is empty but for a few
+        return np.unique(np.floor(points[:, ::-1] * (1 / edge)), axis=0, return_inverse=True)[1].reshape(-1)
     # Each point's own number in the last bits: to sort such numbers takes a fifth of the time of sorting by a key
     packed = key.astype(np.int64) << bits | np.arange(len(points))
     packed.sort()
@@ -84,18 +79,30 @@ def voxel_ranks(points: np.ndarray, edge: float) -> np.ndarray:
     return rank
 
 
+def numbers_in_box(columns: Iterable[np.ndarray], count: int) -> tuple[np.ndarray, int]:
+    """A number for each of ``count`` points' voxel in the points' box, and how many voxels that box has.
+
+    columns: the voxels' whole-numbered indices (count,), axis by axis. Exact where the box has less than 2^53 voxels.
+    """
+    key, cells = np.zeros(count), 1
+    for column in columns:
+        low = column.min()
+        size = int(column.max() - low) + 1
+        cells *= size
+        with np.errstate(over="ignore"):  # of a box that is too large in any case
+            key *= float(size)
+        key += column
+        key -= low
+    return key, cells
+
+
 def occupied_voxels(points: np.ndarray, edge: float) -> int:
     """How many voxels of the given edge hold a point; the grid begins at the points' lower corner."""
     columns = np.array(points.T, float, order="C")  # a copy: thrice as fast as the points' rows
     columns -= columns.min(1, keepdims=True)
-    cells, key = 1.0, np.zeros(len(points))
-    for c in columns:  # the voxel's number in the points' box
-        c /= edge
-        count = np.floor(c, out=c).max() + 1
-        cells *= count
-        key *= count
-        key += c
-    if cells >= 2**53:  # a float holds no such number
+    columns /= edge
+    key, cells = numbers_in_box(np.floor(columns, out=columns), len(points))
+    if cells >= 1 << 53:
         key = voxel_keys(points - points.min(0), edge)
     key.sort()
     return 1 + int(np.count_nonzero(key[1:] != key[:-1]))

@@ -15,6 +15,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.geometry.nearest import NearestDistance
 from fmr_cli.io.stream import COLORS, CloudStream, Column, Survey, collect, stream_of
 from fmr_cli.registration.result import Registration
+from fmr_cli.registration.sites import START as BY_SITE
 
 INDEXED = 2_000_000  # points of the target, at least, that residuals are measured to: some 300 MB with their tree
 
@@ -148,7 +149,7 @@ def summary(source: PointCloud, target: PointCloud, found: Registration) -> list
         f"{scale}overlap {found.overlap:.0%}, RMSE {found.inlier_rmse:.3g}, {found.seconds['total']:.2f} s"
     ]
     lines += found.reasons
-    if found.start == "site":
+    if found.start == BY_SITE:
         lines.append(
             "by way of a site that the model knows: both scans were found there, whatever they share themselves"
         )

@@ -190,10 +190,7 @@ class Pair:
 
     def among(self, T: np.ndarray, others: np.ndarray) -> bool:
         """Whether a pose (4, 4) is the ``same`` as one of others (n, 4, 4)."""
-        off = others[:, :3, 3] - T[:3, 3]
-        near = (off * off).sum(1) < (DISTINCT_EDGES * self.edge) ** 2
-        turned = angle_between(T[:3, :3], others[near, :3, :3]) if near.any() else np.empty(0)
-        return bool((turned < np.radians(DISTINCT_DEGREES)).any())
+        return is_among(T, others, self.edge)
 
     def allowed(self, T_target_source: np.ndarray) -> bool:
         """Whether a pose keeps to the options' ``max_angle`` and ``max_shift``."""
@@ -202,6 +199,17 @@ class Pair:
         return (max_angle is None or angle_degrees(T_target_source) <= max_angle) and (
             max_shift is None or bool(shift <= max_shift)
         )
+
+
+def is_among(T: np.ndarray, others: np.ndarray, edge: float) -> bool:
+    """Whether a pose (4, 4) of a centred cloud is one of others (n, 4, 4), but for what a refinement moves.
+
+    edge: of the voxels that it is registered on.
+    """
+    off = others[:, :3, 3] - T[:3, 3]
+    near = (off * off).sum(1) < (DISTINCT_EDGES * edge) ** 2
+    turned = angle_between(T[:3, :3], others[near, :3, :3]) if near.any() else np.empty(0)
+    return bool((turned < np.radians(DISTINCT_DEGREES)).any())
 
 
 def make_pair(

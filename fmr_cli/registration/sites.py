@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fmr_cli.cloud import angle_degrees, transform_points
-from fmr_cli.geometry.frames import enter_frames
+from fmr_cli.geometry.frames import Frame, enter_frames
 from fmr_cli.geometry.se3 import adjoint
 from fmr_cli.registration.confidence import ALIGNED, Judge, among
 from fmr_cli.registration.looks import FINE
 from fmr_cli.registration.options import Options
-from fmr_cli.registration.pair import DISTINCT_DEGREES, DISTINCT_EDGES, make_pair
+from fmr_cli.registration.pair import is_among, make_pair
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Registration, describe
 
@@ -42,8 +41,8 @@ def there(options: Options) -> Options:
 
 def same(scan: Prepared, a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two poses (4, 4) of a scan, files' coordinates, are one but for what a refinement moves."""
-    off = np.linalg.norm(transform_points(a, scan.centre[None]) - transform_points(b, scan.centre[None]))
-    return bool(off < DISTINCT_EDGES * scan.edge and angle_degrees(np.linalg.inv(a) @ b) < DISTINCT_DEGREES)
+    one, other = (enter_frames(T, scan.frame, Frame()) for T in (a, b))
+    return is_among(one, other[None], scan.edge)
 
 
 @dataclass(frozen=True)
@@ -76,9 +75,11 @@ def composed(
     """
     there, T_target_site = source_there.found, np.linalg.inv(target_there.found.T_target_source)
     confidence = there.confidence * target_there.found.confidence
+    if confidence < ALIGNED or source_there.site is not target_there.site:
+        return None
     pair = make_pair(source, target, options, 1, *FINE)
     T_target_source = pair.enter_centred(T_target_site @ there.T_target_source)
-    if confidence < ALIGNED or source_there.site is not target_there.site or not pair.allowed(T_target_source):
+    if not pair.allowed(T_target_source):
         return None
     judge = Judge(pair)
     judge.consider(T_target_source, START, [])

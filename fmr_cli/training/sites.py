@@ -112,15 +112,16 @@ class Sites:
         done, waiting, parts = list[Part](), sorted(sites, key=len, reverse=True), sorted(rest, key=len, reverse=True)
         while waiting:
             site, *smaller = waiting
-            waiting, joined = self.found_on(site, smaller)
-            parts, more = self.found_on(site, parts)
+            merged = self.merged(site)
+            waiting, joined = self.found_on(merged, smaller)
+            parts, more = self.found_on(merged, parts)
             done.append(site | joined | more)
         return done, parts
 
-    def found_on(self, site: Part, parts: list[Part]) -> tuple[list[Part], Part]:
+    def found_on(self, site: Prepared, parts: list[Part]) -> tuple[list[Part], Part]:
         """Which parts are not found on a site; and the scans of those that are, where they stand there."""
-        merged, report = self.merged(site), partial(self.show, "sites: further scans")
-        poses = side_by_side(lambda part: self.placed(self.merged(part), merged), parts, report)
+        report = partial(self.show, "sites: further scans")
+        poses = side_by_side(lambda part: self.placed(self.merged(part), site), parts, report)
         there: Part = {}
         for part, T_site_part in zip(parts, poses, strict=True):
             if T_site_part is not None:
