@@ -20,7 +20,7 @@ import numpy as np
 
 from fmr_cli.evaluation.verdict import calibration_error
 from fmr_cli.evaluation.verdict_evidence import Judged, decisive, gather
-from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
+from fmr_cli.evaluation.verdict_fit import are_right, cross_validated, fit, judge
 from fmr_cli.registration.confidence import (
     ALIGNED,
     BARE,
@@ -65,14 +65,17 @@ def bounds_in(evidence: Sequence[Judged], weights: Weights) -> list[str]:
     return said
 
 
-def decisions(evidence: Sequence[Judged], confidence: np.ndarray, right: np.ndarray) -> list[str]:
-    """What ``align`` would say of the pairs, ending at one look each."""
+def decisions(evidence: Sequence[Judged], confidence: np.ndarray, best: np.ndarray) -> list[str]:
+    """What ``align`` would say of the pairs, ending at one look each; confidence, best: as ``verdict_fit.judge``."""
     looks: dict[int, dict[Look, int]] = {}
     for i, j in enumerate(evidence):
         looks.setdefault(j.number, {})[j.look] = i
-    ends = [(at, *decisive({look: float(confidence[i]) for look, i in at.items()})) for at in looks.values()]
+    ends = []
+    for at in looks.values():
+        said_of = {look: float(confidence[i]) for look, i in at.items()}
+        ends.append((at, *decisive(said_of, {look: int(evidence[i].place[best[i]]) for look, i in at.items()})))
     where, said = np.array([at[look] for at, look, _ in ends]), np.array([p for *_, p in ends])
-    aligned, good = said >= ALIGNED, right[where]
+    aligned, good = said >= ALIGNED, are_right(evidence, best)[where]
     unique = np.array([evidence[i].unique for i in where])
     kinds = Counter(evidence[i].kind for i in where[aligned & ~good])
     named = "; ".join(f"{count} {kind}" for kind, count in kinds.most_common())
@@ -96,11 +99,12 @@ def main() -> None:
         parser.error(f"--pairs {args.pairs}: at least {LEAST} make a curve, and some hundred make weights")
     args.out.mkdir(exist_ok=True, parents=True)
     evidence = gather(args.pairs, args.seed, args.workers)
-    confidence, right = cross_validated(evidence)
+    confidence, best = cross_validated(evidence)
+    right = are_right(evidence, best)
     print(f"{len(evidence)} looks at {args.pairs} pairs, each judged by weights fitted on others:")
     print(calibration_table(confidence, right))
     print(f"expected calibration error {calibration_error(confidence, right):.3f}")
-    print("as align decides:", *decisions(evidence, confidence, right), sep="\n")
+    print("as align decides:", *decisions(evidence, confidence, best), sep="\n")
     print("by the bundled weights, which may have seen such pairs:")
     print(*decisions(evidence, *judge(evidence, model(None).verdict)), sep="\n")
     weights = fit(evidence)

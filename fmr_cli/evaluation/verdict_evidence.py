@@ -16,10 +16,21 @@ import numpy as np
 from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
-from fmr_cli.registration.confidence import Judge
-from fmr_cli.registration.looks import COARSE, DISPUTED, FINE, HOPELESS, Look, coarse_look, further, surest, taken_up
+from fmr_cli.registration.confidence import Judge, pooled
+from fmr_cli.registration.looks import (
+    COARSE,
+    DISPUTED,
+    FINE,
+    HOPELESS,
+    WIDER,
+    Look,
+    coarse_look,
+    further,
+    surest,
+    taken_up,
+)
 from fmr_cli.registration.options import Options
-from fmr_cli.registration.pair import make_pair
+from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.pipeline import one_blas_thread
 from fmr_cli.registration.prepared import Prepared
 from fmr_cli.registration.result import Stopwatch
@@ -34,13 +45,14 @@ CHUNK = 2  # pairs handed to a worker at a time: a pair takes a second, a hand-o
 class Judged:
     """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool.
 
-    largest: (n,), ``Agreement.largest`` of each; look: which one, see ``looks``; kind, unique: of the pair, see
-    ``verdict_pairs``; number: which pair.
+    largest: (n,), ``Agreement.largest`` of each; place: (n,), a number for each pose, one for what several looks found;
+    look: which one, see ``looks``; kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
     """
 
     x: np.ndarray
     right: np.ndarray
     largest: np.ndarray
+    place: np.ndarray
     look: Look
     kind: str
     unique: bool
@@ -63,7 +75,7 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
     if pair.kind in FAMILIES["degenerate"]:
         return []
     truth = pair.poses[:1]  # the pose at which the scans were taken: its aliases are no righter than chance
-    found = []
+    found, places = list[Judged](), list[np.ndarray]()
     try:
         with one_blas_thread():
             source, target = Prepared(PointCloud(pair.source)), Prepared(PointCloud(pair.target))
@@ -73,10 +85,20 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
                 x = np.array([c.evidence.vector() for c in judge.candidates])
                 if len(x):
                     largest = np.array([c.evidence.largest for c in judge.candidates])
-                    found.append(Judged(x, np.array(right), largest, look, pair.kind, pair.unique, seed[1]))
+                    place = np.array([number_of(c.T_target_source, places, judge.pair) for c in judge.candidates])
+                    found.append(Judged(x, np.array(right), largest, place, look, pair.kind, pair.unique, seed[1]))
     except RegistrationError:  # a street and a teacup: nothing to judge
         return []
     return found
+
+
+def number_of(T_target_source: np.ndarray, places: list[np.ndarray], pair: Pair) -> int:
+    """Which of the places a pose is; one that is none of them is added."""
+    for number, place in enumerate(places):
+        if pair.same(T_target_source, place):
+            return number
+    places.append(T_target_source)
+    return len(places) - 1
 
 
 def all_looks(source: Prepared, target: Prepared) -> dict[Look, Judge]:
@@ -85,12 +107,15 @@ def all_looks(source: Prepared, target: Prepared) -> dict[Look, Judge]:
     for look in COARSE:
         with suppress(RegistrationError):  # too few voxels of that size
             pair = make_pair(source, target, Options(), 1, *look)
-            judges[look] = coarse_look(pair, time, taken_up(look, list(judges.values())))
-    return judges | {FINE: further(source, target, Options(), 1, time, surest(list(judges.values())))}
+            judges[look] = coarse_look(pair, time, taken_up(look, judges))
+    return judges | {FINE: further(source, target, Options(), 1, time, surest(judges.values()))}
 
 
-def decisive(said: Mapping[Look, float]) -> tuple[Look, float]:
-    """Where ``align`` ends (``looks.at_once``): at which look, with which confidence; said: that of each look."""
+def decisive(said: Mapping[Look, float], place: Mapping[Look, int]) -> tuple[Look, float]:
+    """Where ``align`` ends (``looks.at_once``): at which look, with which confidence.
+
+    said: of each look the confidence in its best pose; place: which one that is.
+    """
     coarse = [look for look in COARSE if look in said]
     for look in coarse:
         if said[look] >= COARSE[look]:
@@ -98,6 +123,9 @@ def decisive(said: Mapping[Look, float]) -> tuple[Look, float]:
     best = max(coarse, key=lambda look: said[look], default=FINE)
     if said[best] < HOPELESS:
         return best, said[best]
+    close = max((look for look in coarse if look != WIDER), key=lambda look: said[look], default=FINE)
+    if FINE in said and place[close] == place[FINE]:
+        return FINE, max(said[FINE], pooled([said[close], said[FINE]]))
     if FINE in said and said[FINE] >= DISPUTED * said[best]:
         return FINE, said[FINE]
     return best, DISPUTED * said[best]

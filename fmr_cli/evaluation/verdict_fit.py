@@ -76,24 +76,29 @@ def logistic(x: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def judge(evidence: Sequence[Judged], weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """What ``align`` would say of each look: the confidence of its best pose (n,), and whether that is right (n,)."""
+    """What ``align`` would say of each look: the confidence of its best pose (n,), and which one that is (n,)."""
     said = []
     for j in evidence:
         shares, weigh = confidences(j.x, j.largest, weights)
         best = int(weigh.argmax())
-        said.append((shares[best], j.right[best]))
-    confidence, right = zip(*said, strict=True)
-    return np.array(confidence), np.array(right)
+        said.append((shares[best], best))
+    confidence, which = zip(*said, strict=True)
+    return np.array(confidence), np.array(which)
+
+
+def are_right(evidence: Sequence[Judged], best: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether the best pose of each look (n,) is right."""
+    return np.array([j.right[i] for j, i in zip(evidence, best, strict=True)])
 
 
 def cross_validated(
     evidence: Sequence[Judged], fit: Callable[[Sequence[Judged]], Weights] = fit
 ) -> tuple[np.ndarray, np.ndarray]:
     """``judge`` of each look by weights that were fitted on other pairs, one of FOLDS at a time."""
-    confidence, right = np.zeros(len(evidence)), np.zeros(len(evidence), bool)
+    confidence, best = np.zeros(len(evidence)), np.zeros(len(evidence), int)
     for fold in range(FOLDS):
         here = [i for i, j in enumerate(evidence) if j.number % FOLDS == fold]
         if here:
             weights = fit([j for j in evidence if j.number % FOLDS != fold])
-            confidence[here], right[here] = judge([evidence[i] for i in here], weights)
-    return confidence, right
+            confidence[here], best[here] = judge([evidence[i] for i in here], weights)
+    return confidence, best

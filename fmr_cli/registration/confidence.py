@@ -147,8 +147,22 @@ def among(confidence: float, others: Sequence[float]) -> float:
 
     Each weighs its odds against "none of them", as if it were alone.
     """
-    odds, *more = (p / max(1 - p, 1e-12) for p in (confidence, *others))
-    return odds / (1 + odds + sum(more))
+    own, *more = map(odds, (confidence, *others))
+    return own / (1 + own + sum(more))
+
+
+def pooled(confidences: Sequence[float]) -> float:
+    """What several looks at one pair say together of one pose: the probability of their mean log odds.
+
+    Not of their sum: they see the same scans, and are wrong together.
+    """
+    mean = float(np.prod([odds(p) for p in confidences])) ** (1 / len(confidences))
+    return mean / (1 + mean)
+
+
+def odds(probability: float) -> float:
+    """Of a probability, up to 1e12."""
+    return probability / max(1 - probability, 1e-12)
 
 
 def most(x: np.ndarray) -> float:

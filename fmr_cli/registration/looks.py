@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, refinement
-from fmr_cli.registration.confidence import LIKELY, Judge, in_words
+from fmr_cli.registration.confidence import LIKELY, Judge, in_words, pooled
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -57,44 +58,71 @@ def at_once(
 ) -> Judge:
     """Looks at all of the target, dearer ones while none is sure. first: what FIRST has found already.
 
-    Where none is sure and the pair is not hopeless, the last one has the last word on what is ``aligned``; the pose is
-    that of the look that is surer then.
+    Where none is sure and the pair is not hopeless, the last one has the last word on what is ``aligned``, unless a
+    close one is surer of the same pose: then both have it. Else the pose is that of the look that is surer then.
     """
-    judges, looks = [first] if first else [], list[Look]()
+    judges, looks = {FIRST: first} if first else {}, list[Look]()
     if isinstance(options.init, str) and options.init == "auto":
         looks = [WIDER] if options.voxel_size else [FIRST, CLOSER, WIDER][len(judges) :]
     for look in looks:
         with suppress(RegistrationError):  # too few voxels of that size
             pair = make_pair(source, target, options, threads, *look)
-            judges.append(coarse_look(pair, time, taken_up(look, judges)))
-            if judges[-1].sure(COARSE[look]):
-                return finer(judges[-1])
-    coarse = surest(judges)
-    if coarse and not coarse.sure(HOPELESS) and not few(judges[0].pair):
+            judges[look] = coarse_look(pair, time, taken_up(look, judges))
+            if judges[look].sure(COARSE[look]):
+                return finer(judges[look])
+    coarse = surest(judges.values())
+    if coarse and not coarse.sure(HOPELESS) and not few(next(iter(judges.values())).pair):
         return finer(coarse)
     fine = further(source, target, options, threads, time, former=coarse)
+    close = surest(judge for look, judge in judges.items() if look != WIDER)
+    if close and same_best(close, fine):
+        return fine if fine.sure(close.best.confidence) else together(close, fine)
     if not coarse or fine.sure(DISPUTED * coarse.best.confidence):
         return fine
     return disputed(finer(coarse), fine)
 
 
-def surest(judges: list[Judge]) -> Judge | None:
+def surest(judges: Iterable[Judge]) -> Judge | None:
     """The look that is surest of its best pose: the next one goes on from its poses. None where none has any."""
     return max((j for j in judges if j.candidates), key=lambda j: j.best.confidence, default=None)
 
 
-def taken_up(look: Look, judges: list[Judge]) -> Judge | None:
+def taken_up(look: Look, judges: Mapping[Look, Judge]) -> Judge | None:
     """Whose poses a coarse look goes on from: the surest look's before it; on WIDER voxels not if they have no hope.
 
     There they would have to be refined anew, which those are not worth.
     """
-    return surest([judge for judge in judges if look != WIDER or judge.sure(HOPELESS)])
+    return surest(judge for judge in judges.values() if look != WIDER or judge.sure(HOPELESS))
+
+
+def same_best(coarse: Judge, fine: Judge) -> bool:
+    """Whether two looks have the same best pose."""
+    return coarse.pair.same(coarse.best.T_target_source, fine.best.T_target_source)
+
+
+def together(close: Judge, fine: Judge) -> Judge:
+    """The fine look, with what both looks say of its best pose; the other poses share what is left, as before.
+
+    Fine voxels see more, and yet of poses that they were less sure of than close ones, more were right than they say:
+    of 1,400 made-up pairs, each judged by weights that were fitted on others, 10 more were ``aligned``, and none of
+    these wrong.
+    """
+    best, *others = fine.candidates
+    confidence = pooled([close.best.confidence, best.confidence])
+    left = (1 - confidence) / (1 - best.confidence)
+    return replace(
+        fine,
+        candidates=[
+            replace(best, confidence=confidence),
+            *(replace(c, confidence=left * c.confidence) for c in others),
+        ],
+    )
 
 
 def disputed(coarse: Judge, fine: Judge) -> Judge:
     """The coarse look, with what DISPUTED leaves of its confidence; the best pose has what the fine look says of it."""
     best, *others = (replace(c, confidence=DISPUTED * c.confidence) for c in coarse.candidates)
-    same = coarse.pair.same(best.T_target_source, fine.best.T_target_source)
+    same = same_best(coarse, fine)
     says = "less speaks for it" if same else f"the scans fit better {in_words(coarse.pair, best, fine.best)}"
     return replace(coarse, candidates=[replace(best, doubt=f"on finer voxels {says}"), *others])
 

@@ -9,8 +9,8 @@ import pytest
 
 from fmr_cli.cloud import PointCloud
 from fmr_cli.evaluation.verdict import calibration_error
-from fmr_cli.evaluation.verdict_evidence import Judged, all_looks, decisive, pair_evidence
-from fmr_cli.evaluation.verdict_fit import cross_validated, fit, judge
+from fmr_cli.evaluation.verdict_evidence import Judged, all_looks, decisive, number_of, pair_evidence
+from fmr_cli.evaluation.verdict_fit import are_right, cross_validated, fit, judge
 from fmr_cli.registration.confidence import ALIGNED, DETAIL, MISSING, QUALITY, SHARE, STRETCH
 from fmr_cli.registration.looks import CLOSER, DISPUTED, FINE, FIRST, SURE, WIDER, at_once
 from fmr_cli.registration.options import Options
@@ -34,12 +34,13 @@ def drawn() -> list[Judged]:
         x[:, bounding] = np.abs(x[:, bounding])  # nothing that bounds a confidence by itself
         right = np.zeros(3, bool)
         right[0] = rng.random() < 1 / (1 + np.exp(-2 * x[0, 1]))
-        looks.append(Judged(x, right, np.zeros(3), FIRST, "drawn", True, number))
+        looks.append(Judged(x, right, np.zeros(3), np.arange(3), FIRST, "drawn", True, number))
     return looks
 
 
 def test_confidence_is_the_share_that_is_right(drawn):
-    confidence, right = cross_validated(drawn)
+    confidence, best = cross_validated(drawn)
+    right = are_right(drawn, best)
     assert len(confidence) == len(drawn)
     for low in (0.0, 0.25, 0.5, 0.75):
         here = (confidence >= low) & (confidence < low + 0.25)
@@ -68,7 +69,8 @@ def test_the_table_counts_every_pair_and_its_right_ones():
 
 def test_the_plot_is_a_png(tmp_path, drawn):
     pytest.importorskip("matplotlib")
-    plot_calibration(tmp_path / "c.png", *judge(drawn, fit(drawn)))
+    confidence, best = judge(drawn, fit(drawn))
+    plot_calibration(tmp_path / "c.png", confidence, are_right(drawn, best))
     assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -81,28 +83,39 @@ def test_a_pair_gives_the_same_evidence_every_time_and_one_of_its_poses_is_right
         assert a.right.any()
 
 
+ONE_PLACE, TWO_PLACES = dict.fromkeys((FIRST, CLOSER, WIDER, FINE), 0), {FIRST: 0, CLOSER: 0, WIDER: 0, FINE: 1}
+
+
 def test_the_first_look_that_is_sure_decides_and_a_wide_one_has_to_be_surer():
     said = {FIRST: 0.2, CLOSER: SURE, WIDER: 1.0, FINE: 1.0}
-    assert decisive(said) == (CLOSER, SURE)
-    assert decisive(said | {FIRST: SURE}) == (FIRST, SURE)
-    assert decisive(said | {CLOSER: 0.9}) == (WIDER, 1.0)
-    assert decisive(said | {CLOSER: 0.9, WIDER: SURE}) == (FINE, 1.0)
+    assert decisive(said, ONE_PLACE) == (CLOSER, SURE)
+    assert decisive(said | {FIRST: SURE}, ONE_PLACE) == (FIRST, SURE)
+    assert decisive(said | {CLOSER: 0.9}, ONE_PLACE) == (WIDER, 1.0)
+    assert decisive(said | {CLOSER: 0.9, WIDER: SURE}, ONE_PLACE) == (FINE, 1.0)
 
 
-def test_fine_voxels_alone_call_aligned_what_no_coarse_look_is_sure_of():
+def test_fine_voxels_alone_decide_where_no_coarse_look_is_sure_of_its_pose():
     said = {FIRST: 0.1, CLOSER: 0.9, WIDER: 0.5}
-    assert decisive(said | {FINE: ALIGNED}) == (FINE, ALIGNED)
-    assert decisive(said | {FINE: 0.5}) == (FINE, 0.5)
-    assert decisive(said | {FINE: 0.1}) == (CLOSER, DISPUTED * 0.9)
-    assert decisive({FIRST: 0.01, FINE: 0.3}) == (FIRST, 0.01)  # hopeless
-    assert decisive({FINE: 0.3}) == (FINE, 0.3)
+    assert decisive(said | {FINE: ALIGNED}, TWO_PLACES) == (FINE, ALIGNED)
+    assert decisive(said | {FINE: 0.5}, TWO_PLACES) == (FINE, 0.5)
+    assert decisive(said | {FINE: 0.1}, TWO_PLACES) == (CLOSER, DISPUTED * 0.9)
+    assert decisive({FIRST: 0.01, FINE: 0.3}, TWO_PLACES) == (FIRST, 0.01)  # hopeless
+    assert decisive({FINE: 0.3}, TWO_PLACES) == (FINE, 0.3)
 
 
-@pytest.mark.parametrize("kind", ["copy", "facade", "seats", "object, 10 to 30 %"])
+def test_of_a_pose_that_close_voxels_are_surer_of_than_fine_ones_both_have_a_say():
+    said = {FIRST: 0.1, CLOSER: 0.9, WIDER: 0.95}
+    assert decisive(said | {FINE: 0.5}, ONE_PLACE) == (FINE, pytest.approx(0.75))  # odds 9 and 1: 3
+    assert decisive(said | {FINE: 0.94}, ONE_PLACE) == (FINE, 0.94)
+
+
+@pytest.mark.parametrize("kind", ["copy", "facade", "seats", "object, 10 to 30 %", "facade, a door in both"])
 def test_what_the_looks_decide_is_what_align_says(kind):
     pair = fresh_pair(kind, 42_000, 0)
     with one_blas_thread():
         source, target = Prepared(PointCloud(pair.source)), Prepared(PointCloud(pair.target))
-        said = {look: judge.best.confidence for look, judge in all_looks(source, target).items() if judge.candidates}
+        judges = {look: judge for look, judge in all_looks(source, target).items() if judge.candidates}
         judge = at_once(source, target, Options(), 1, Stopwatch())
-    assert decisive(said)[1] == judge.best.confidence
+    places: list[np.ndarray] = []
+    place = {look: number_of(j.best.T_target_source, places, j.pair) for look, j in judges.items()}
+    assert decisive({look: j.best.confidence for look, j in judges.items()}, place)[1] == judge.best.confidence
