@@ -22,31 +22,51 @@ from fmr_cli.feature_metric.layers import Layers, hidden
 from fmr_cli.geometry.nearest import along_curve
 
 CHUNK = 256  # points; their activation of CHUNK x K (1 MB at 1024 channels) stays in cache
+PART = 1024
 MANY = 6144  # points: of fewer, it takes less time to multiply all with all weights
 FEW = 512  # points, which are looked at first; 256 to 1,024 take the same time
 # Of ``contest``'s bound. Fewer axes, or more points a block, cost less and leave more to multiply; with 24 axes, or 8
 # points, it takes the same time (12,288 points of a room).
-AXES, BLOCK = 16, 16
+AXES, BLOCK = 24, 16
 ROUNDING = 1e-6  # of a squared norm: what float32 leaves between two ways to compute it
-CROWD = 32  # pairs a point of a part, at most: of copies of one point all would tie, in gigabytes
-PAIRS = 512  # of a point and a channel, at once: the activations and weights of so many stay in cache
 
-Run = Callable[[Callable[..., Any], Iterable[Any]], Iterable[Any]]
+Run = Callable[..., Iterable[Any]]  # as ``map``
 
 
 @contextmanager
 def spread(threads: int) -> Iterator[Run]:
-    """A ``map`` over that many threads."""
+    """A ``map`` over that many threads, the caller's among them: it need not wait for another to wake up."""
     if threads == 1:
         yield map
         return
-    with ThreadPoolExecutor(threads) as pool:
-        yield pool.map
+    with ThreadPoolExecutor(threads - 1) as pool:
+
+        def run(function: Callable[..., Any], *each: Iterable[Any]) -> list[Any]:
+            todo, done = iter(list(enumerate(zip(*each, strict=False)))), {}
+
+            def work() -> None:
+                for number, arguments in todo:
+                    done[number] = function(*arguments)
+
+            others = [pool.submit(work) for _ in range(threads - 1)]
+            work()
+            for other in others:
+                if not other.cancel():  # it never began, and nothing is left for it
+                    other.result()
+            return [done[number] for number in range(len(done))]
+
+        yield run
 
 
-def jobs(starts: int, count: int) -> list[tuple[int, slice]]:
+def jobs(starts: int, count: int, size: int) -> list[tuple[int, slice]]:
     """(start, part of the points) for each start and each part, always the same whatever the number of threads."""
-    return [(start, slice(i, i + CHUNK)) for start in range(starts) for i in range(0, count, CHUNK)]
+    return [(start, slice(i, i + size)) for start in range(starts) for i in range(0, count, size)]
+
+
+def left_over(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """How long, rounded up, what orthonormal axes leave of each x: (n, width), z (n, AXES) along them -> (n, 1)."""
+    square, along = (np.einsum("ij,ij->i", y, y) for y in (x, z))
+    return np.sqrt(np.maximum(square - along, 0) + ROUNDING * square)[:, None]
 
 
 def spaced(count: int, few: int) -> np.ndarray:
@@ -56,25 +76,14 @@ def spaced(count: int, few: int) -> np.ndarray:
 
 @dataclass
 class Rivals:
-    """The points that may win a channel, as T pairs of the two in order of the channels, at least one of each.
+    """Of a part of a cloud: the points that may win a channel, and the channels that one of them may win.
 
-    index: (M,) of the points in their cloud; points: (M, 3) float32; point: (T,) of each pair, its place among these;
-    channel: (T,) of each pair; first: (K,) pair of each channel; complete: whether none were too many to keep.
+    index: (n,) of the points in the cloud; points: (n, 3) float32; channels: (c,).
     """
 
     index: np.ndarray
     points: np.ndarray
-    point: np.ndarray
-    channel: np.ndarray
-    first: np.ndarray
-    complete: bool
-
-    def winners(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of the pairs' values (T,): each channel's largest (K,), and the index of its point in the cloud (K,)."""
-        best = np.maximum.reduceat(value, self.first)
-        pair = (value == best[self.channel]).nonzero()[0]
-        pair = pair[np.searchsorted(self.channel[pair], np.arange(len(best)))]
-        return best, self.index[self.point[pair]]
+    channels: np.ndarray
 
 
 class NumpyEncoder:
@@ -87,6 +96,7 @@ class NumpyEncoder:
         self.layers = layers
         self._transposed = [np.ascontiguousarray(W.T) for W, _ in layers]
         self._own = threading.local()
+        self._exact = [(W.astype(float), b.astype(float)) for W, b in layers]  # a product of both types converts W
         self._unmoved = self.posed(np.eye(4))
 
     def __call__(self, points: np.ndarray, threads: int = 1) -> np.ndarray:
@@ -110,10 +120,10 @@ class NumpyEncoder:
         relu(z + b) = max(z, -b) + b, and the b goes through the next layer's matrix into its bias: one pass over an
         activation in place of two, and none to move the points.
         """
-        W, b = self.layers[0]
+        W, b = self._exact[0]
         shift = W @ g[:3, 3] + b
         layers = [((W @ g[:3, :3]).T.astype(np.float32), shift.astype(np.float32))]
-        for (W, b), transposed in zip(self.layers[1:], self._transposed[1:], strict=True):
+        for (W, b), transposed in zip(self._exact[1:], self._transposed[1:], strict=True):
             shift = W @ shift + b
             layers.append((transposed, shift.astype(np.float32)))
         return [*layers[:-1], (self.layers[-1][0], layers[-1][1])]
@@ -124,7 +134,7 @@ class NumpyEncoder:
         In this thread's own memory, good until its next call: the pages of a fresh array cost as much as the product.
         """
         if not hasattr(self._own, "room"):
-            self._own.room = [np.empty(CHUNK * len(b), np.float32) for _, b in self.layers]
+            self._own.room = [np.empty(PART * len(b), np.float32) for _, b in self.layers]
         x = points
         for (W, b), room in zip(layers[:-1], self._own.room, strict=False):
             out = np.matmul(x, W, out=room[: len(points) * len(b)].reshape(len(points), -1))
@@ -136,23 +146,27 @@ class NumpyEncoder:
         shape = len(A), B.shape[1]
         return np.matmul(A, B, out=self._own.room[-1][: shape[0] * shape[1]].reshape(shape))
 
+    def tops(self, W: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The largest w · x for each row w of W (c, width), and the row of x (n, width) that has it: (c,), (c,)."""
+        values = self.product(W, x.T)
+        index = values.argmax(1)
+        return values[np.arange(len(W)), index], index
+
     def peaks(self, points: np.ndarray, posed: list[Layers], run: Run) -> tuple[np.ndarray, np.ndarray]:
         """F of the points (N, 3) float32 by each of S ``posed`` layers, and its critical points: (S, K), (S, K)."""
-        channels = np.arange(len(self.layers[-1][1]))
 
         def part(job: tuple[int, slice]) -> tuple[np.ndarray, np.ndarray]:
             layers = posed[job[0]]
-            values = self.product(layers[-1][0], self.last_hidden(points[job[1]], layers).T)
-            index = values.argmax(1)
-            return values[channels, index], index + job[1].start
+            value, index = self.tops(layers[-1][0], self.last_hidden(points[job[1]], layers))
+            return value, index + job[1].start
 
-        parts = list(run(part, jobs(len(posed), len(points))))
-        value, index = (np.array(x).reshape(len(posed), -1, len(channels)) for x in zip(*parts, strict=True))
+        parts = list(run(part, jobs(len(posed), len(points), CHUNK)))
+        value, index = (np.array(x).reshape(len(posed), -1, x[0].size) for x in zip(*parts, strict=True))
         best = value.argmax(1)[:, None]
         value, index = (np.take_along_axis(x, best, 1)[:, 0] for x in (value, index))
         return value + np.array([layers[-1][1] for layers in posed]), index
 
-    def whole(self, points: np.ndarray, posed: Layers, run: Run) -> tuple[np.ndarray, np.ndarray, Rivals]:
+    def whole(self, points: np.ndarray, posed: Layers, run: Run) -> tuple[np.ndarray, np.ndarray, list[Rivals]]:
         """``contest`` of all points with FEW of them, spread evenly over their order."""
         few = spaced(len(points), FEW)
         feature, index = (x[0] for x in self.peaks(points[few], [posed], run))
@@ -160,62 +174,66 @@ class NumpyEncoder:
 
     def contest(
         self, points: np.ndarray, posed: Layers, feature: np.ndarray, index: np.ndarray, margin: float, run: Run
-    ) -> tuple[np.ndarray, np.ndarray, Rivals]:
+    ) -> tuple[np.ndarray, np.ndarray, list[Rivals]]:
         """F (K,) of all points (N, 3) float32 by ``posed`` layers, its critical points (K,), and their rivals.
 
         feature, index: (K,) each, the same of some of the points. Rivals are these, and all that exceed their feature
-        less the margin; where those crowd (one stray point makes the rest of a cloud small), the best of each part. A
-        part of the points is multiplied with a channel's weights w only if it can hold one, by a bound on its blocks,
-        which are small where the points are in ``along_curve``'s order: with x = A z + e what feeds the last layer, A
-        a few orthonormal axes, e across them, and z within c ± h,
+        less the margin. A chunk of the points is multiplied with a channel's weights w only if it can hold one, by a
+        bound on its blocks, which are small where the points are in ``along_curve``'s order: with x = A z + e what
+        feeds the last layer, A a few orthonormal axes and e across them, and a = Aᵀw split by the sign of its parts,
 
-            w · x = (Aᵀw) · z + (w - AAᵀw) · e ≤ (Aᵀw) · c + |Aᵀw| · h + ‖w - AAᵀw‖ max ‖e‖
+            w · x = a · z + (w - Aa) · e ≤ max(a, 0) · max(z) + max(-a, 0) · max(-z) + ‖w - Aa‖ max ‖e‖
         """
         W, b = posed[-1]
         some = self.last_hidden(points[spaced(len(points), 2 * AXES)], posed)
         axes = np.linalg.svd(some, full_matrices=False)[2][:AXES].T
         along = W @ axes
-        across = np.linalg.norm(W - along @ axes.T, axis=1, keepdims=True)
-        bounds = np.concatenate([along, np.abs(along), across], 1).T.copy()
-        above, channels = feature - b - np.float32(margin), np.arange(len(b))
+        bounds = np.concatenate([np.maximum(along, 0), np.maximum(-along, 0), left_over(W, along)], 1).T.copy()
+        above = feature - b - np.float32(margin)
 
-        def part(job: tuple[int, slice]) -> tuple[np.ndarray, ...]:
-            x = self.last_hidden(points[job[1]], posed)
-            z, square, blocks = x @ axes, np.einsum("ij,ij->i", x, x), np.arange(0, len(x), BLOCK)
-            e = np.sqrt(np.maximum(square - np.einsum("ij,ij->i", z, z), 0) + ROUNDING * square)
-            low, high, e = (f.reduceat(y, blocks) for f, y in ((np.minimum, z), (np.maximum, z), (np.maximum, e)))
-            bound = self.product(np.concatenate([(low + high) / 2, (high - low) / 2, e[:, None]], 1), bounds)
-            able = (bound.max(0) > above).nonzero()[0]
-            values = self.product(W[able], x.T)
-            reached = values > above[able, None]
-            crowded = np.count_nonzero(reached) > CROWD * len(x)
-            pair = np.arange(0, values.size, len(x)) + values.argmax(1) if crowded else np.flatnonzero(reached)
-            which, point = np.divmod(pair, len(x))
-            return point + job[1].start, able[which], values.reshape(-1)[pair], np.array([crowded])
+        def part(job: tuple[int, slice]) -> tuple[Rivals, tuple[np.ndarray, np.ndarray]]:
+            own = points[job[1]]
+            x = self.last_hidden(own, posed)
+            z = x @ axes
+            most = np.concatenate([z, -z, left_over(x, z)], 1)
+            if len(most) % BLOCK:
+                most = np.pad(most, ((0, -len(most) % BLOCK), (0, 0)), "edge")
+            bound = self.product(most.reshape(-1, BLOCK, most.shape[1]).max(1), bounds)
+            able = [bound[i : i + CHUNK // BLOCK].max(0) > above for i in range(0, len(bound), CHUNK // BLOCK)]
 
-        parts = [(index, channels, feature - b, np.array([False])), *run(part, jobs(1, len(points)))]
-        point, channel, value, crowded = (np.concatenate(x) for x in zip(*parts, strict=True))
-        order = np.argsort(channel, kind="stable")
-        seen, point = np.unique(point[order], return_inverse=True)
-        first = np.searchsorted(channel[order], channels)
-        rivals = Rivals(seen, points[seen], point, channel[order], first, not crowded.any())
-        best, critical = rivals.winners(value[order])
-        return best + b, critical, rivals
+            point, channel = np.zeros(len(x), bool), np.zeros(len(b), bool)
+            point[0] = True  # one at least: of none there is no largest
+            for start, may in zip(range(0, len(x), CHUNK), able, strict=True):
+                may = may.nonzero()[0]
+                reached = self.product(x[start : start + CHUNK], W[may].T) > above[may]
+                which, win = np.divmod(np.flatnonzero(reached), max(len(may), 1))
+                point[start + which], channel[may[win]] = True, True
+            here = (index >= job[1].start) & (index < job[1].stop)
+            point[index[here] - job[1].start], channel[here] = True, True
+            rivals = Rivals(job[1].start + point.nonzero()[0], own[point], channel.nonzero()[0])
+            return rivals, self.tops(W[rivals.channels], x[point])
 
-    def among(self, rivals: Rivals, posed: Layers, run: Run) -> tuple[np.ndarray, np.ndarray]:
+        rivals, tops = zip(*run(part, jobs(1, len(points), PART)), strict=True)
+        return *self.winners(rivals, tops, b), list(rivals)
+
+    def among(self, rivals: list[Rivals], posed: Layers, run: Run) -> tuple[np.ndarray, np.ndarray]:
         """F of the rivals alone by ``posed`` layers, each in its own channels, and its critical points: (K,), (K,)."""
         W, b = posed[-1]
 
-        def hidden_part(job: tuple[int, slice]) -> np.ndarray:
-            return self.last_hidden(rivals.points[job[1]], posed).copy()
+        def part(some: Rivals) -> tuple[np.ndarray, np.ndarray]:
+            return self.tops(W[some.channels], self.last_hidden(some.points, posed))
 
-        def part(start: int) -> np.ndarray:
-            pairs = slice(start, start + PAIRS)
-            return np.einsum("ij,ij->i", x[rivals.point[pairs]], W[rivals.channel[pairs]])
+        return self.winners(rivals, run(part, rivals), b)
 
-        x = np.concatenate(list(run(hidden_part, jobs(1, len(rivals.points)))))
-        best, critical = rivals.winners(np.concatenate(list(run(part, range(0, len(rivals.point), PAIRS)))))
-        return best + b, critical
+    def winners(
+        self, rivals: Iterable[Rivals], tops: Iterable[tuple[np.ndarray, np.ndarray]], b: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """F (K,) and its critical points (K,) from the ``tops`` of each part's rivals; b: (K,) still to be added."""
+        value, index = np.full((len(rivals), len(b)), -np.inf, np.float32), np.zeros((len(rivals), len(b)), np.intp)
+        for row, (part, (top, which)) in enumerate(zip(rivals, tops, strict=True)):
+            value[row, part.channels], index[row, part.channels] = top, part.index[which]
+        best = value.argmax(0), np.arange(len(b))
+        return value[best] + b, index[best]
 
     def jacobian(self, points: np.ndarray, index: np.ndarray, g: np.ndarray | None = None) -> np.ndarray:
         """J of F(exp(-xi) P) at xi = 0, P the points (N, 3) moved by g (4, 4): index (K,) -> (K, 6) float32."""
