@@ -7,6 +7,7 @@ those multiplied with a channel's weights that can win the channel, by a bound t
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -31,6 +32,7 @@ AXES, BLOCK = 24, 16
 ROUNDING = 1e-6  # of a squared norm: what float32 leaves between two ways to compute it
 
 Run = Callable[..., Iterable[Any]]  # as ``map``
+Found = tuple[np.ndarray, np.ndarray, np.ndarray]  # channels (c,), the largest values in them, and of which points
 
 
 @contextmanager
@@ -61,6 +63,21 @@ def spread(threads: int) -> Iterator[Run]:
 def jobs(starts: int, count: int, size: int) -> list[tuple[int, slice]]:
     """(start, part of the points) for each start and each part, always the same whatever the number of threads."""
     return [(start, slice(i, i + size)) for start in range(starts) for i in range(0, count, size)]
+
+
+def tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The largest of each row, and its place in it: (c, n) -> (c,), (c,)."""
+    index = values.argmax(1)
+    return values[np.arange(len(values)), index], index
+
+
+def winners(found: list[Found], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of ``count`` = K channels, the largest value that was found (K,), and the index of its point (K,)."""
+    value, index = np.full((len(found), count), -np.inf, np.float32), np.zeros((len(found), count), np.intp)
+    for row, (channels, top, point) in enumerate(found):
+        value[row, channels], index[row, channels] = top, point
+    best = value.argmax(0), np.arange(count)
+    return value[best], index[best]
 
 
 def left_over(x: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -146,18 +163,12 @@ class NumpyEncoder:
         shape = len(A), B.shape[1]
         return np.matmul(A, B, out=self._own.room[-1][: shape[0] * shape[1]].reshape(shape))
 
-    def tops(self, W: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The largest w · x for each row w of W (c, width), and the row of x (n, width) that has it: (c,), (c,)."""
-        values = self.product(W, x.T)
-        index = values.argmax(1)
-        return values[np.arange(len(W)), index], index
-
     def peaks(self, points: np.ndarray, posed: list[Layers], run: Run) -> tuple[np.ndarray, np.ndarray]:
         """F of the points (N, 3) float32 by each of S ``posed`` layers, and its critical points: (S, K), (S, K)."""
 
         def part(job: tuple[int, slice]) -> tuple[np.ndarray, np.ndarray]:
             layers = posed[job[0]]
-            value, index = self.tops(layers[-1][0], self.last_hidden(points[job[1]], layers))
+            value, index = tops(self.product(layers[-1][0], self.last_hidden(points[job[1]], layers).T))
             return value, index + job[1].start
 
         parts = list(run(part, jobs(len(posed), len(points), CHUNK)))
@@ -185,14 +196,14 @@ class NumpyEncoder:
             w · x = a · z + (w - Aa) · e ≤ max(a, 0) · max(z) + max(-a, 0) · max(-z) + ‖w - Aa‖ max ‖e‖
         """
         W, b = posed[-1]
-        some = self.last_hidden(points[spaced(len(points), 2 * AXES)], posed)
-        axes = np.linalg.svd(some, full_matrices=False)[2][:AXES].T
+        x = self.last_hidden(points[spaced(len(points), 2 * AXES)], posed)
+        axes = np.linalg.svd(x, full_matrices=False)[2][:AXES].T
         along = W @ axes
         bounds = np.concatenate([np.maximum(along, 0), np.maximum(-along, 0), left_over(W, along)], 1).T.copy()
         above = feature - b - np.float32(margin)
 
-        def part(job: tuple[int, slice]) -> tuple[Rivals, tuple[np.ndarray, np.ndarray]]:
-            own = points[job[1]]
+        def part(job: tuple[int, slice]) -> tuple[Rivals, list[Found]]:
+            first, own = job[1].start, points[job[1]]
             x = self.last_hidden(own, posed)
             z = x @ axes
             most = np.concatenate([z, -z, left_over(x, z)], 1)
@@ -201,39 +212,35 @@ class NumpyEncoder:
             bound = self.product(most.reshape(-1, BLOCK, most.shape[1]).max(1), bounds)
             able = [bound[i : i + CHUNK // BLOCK].max(0) > above for i in range(0, len(bound), CHUNK // BLOCK)]
 
-            point, channel = np.zeros(len(x), bool), np.zeros(len(b), bool)
-            point[0] = True  # one at least: of none there is no largest
+            here = (index >= first) & (index < job[1].stop)
+            point, found = np.zeros(len(x), bool), []
+            point[index[here] - first] = True
             for start, may in zip(range(0, len(x), CHUNK), able, strict=True):
-                may = may.nonzero()[0]
-                reached = self.product(x[start : start + CHUNK], W[may].T) > above[may]
-                which, win = np.divmod(np.flatnonzero(reached), max(len(may), 1))
-                point[start + which], channel[may[win]] = True, True
-            here = (index >= job[1].start) & (index < job[1].stop)
-            point[index[here] - job[1].start], channel[here] = True, True
-            rivals = Rivals(job[1].start + point.nonzero()[0], own[point], channel.nonzero()[0])
-            return rivals, self.tops(W[rivals.channels], x[point])
+                channels, chunk = may.nonzero()[0], slice(start, start + CHUNK)
+                values = self.product(W[channels], x[chunk].T)
+                top, which = tops(values)
+                over = (top > above[channels]).nonzero()[0]
+                channels = channels[over]
+                point[chunk] |= (values[over] > above[channels, None]).any(0)
+                here[channels] = True
+                found.append((channels, top[over], first + start + which[over]))
+            return Rivals(first + point.nonzero()[0], own[point], here.nonzero()[0]), found
 
-        rivals, tops = zip(*run(part, jobs(1, len(points), PART)), strict=True)
-        return *self.winners(rivals, tops, b), list(rivals)
+        rivals, found = zip(*run(part, jobs(1, len(points), PART)), strict=True)
+        some = (np.arange(len(b)), feature - b, index)
+        best, critical = winners([some, *itertools.chain.from_iterable(found)], len(b))
+        return best + b, critical, [part for part in rivals if len(part.index)]
 
     def among(self, rivals: list[Rivals], posed: Layers, run: Run) -> tuple[np.ndarray, np.ndarray]:
         """F of the rivals alone by ``posed`` layers, each in its own channels, and its critical points: (K,), (K,)."""
         W, b = posed[-1]
 
-        def part(some: Rivals) -> tuple[np.ndarray, np.ndarray]:
-            return self.tops(W[some.channels], self.last_hidden(some.points, posed))
+        def part(some: Rivals) -> Found:
+            top, which = tops(self.product(W[some.channels], self.last_hidden(some.points, posed).T))
+            return some.channels, top, some.index[which]
 
-        return self.winners(rivals, run(part, rivals), b)
-
-    def winners(
-        self, rivals: Iterable[Rivals], tops: Iterable[tuple[np.ndarray, np.ndarray]], b: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """F (K,) and its critical points (K,) from the ``tops`` of each part's rivals; b: (K,) still to be added."""
-        value, index = np.full((len(rivals), len(b)), -np.inf, np.float32), np.zeros((len(rivals), len(b)), np.intp)
-        for row, (part, (top, which)) in enumerate(zip(rivals, tops, strict=True)):
-            value[row, part.channels], index[row, part.channels] = top, part.index[which]
-        best = value.argmax(0), np.arange(len(b))
-        return value[best] + b, index[best]
+        best, critical = winners(list(run(part, rivals)), len(b))
+        return best + b, critical
 
     def jacobian(self, points: np.ndarray, index: np.ndarray, g: np.ndarray | None = None) -> np.ndarray:
         """J of F(exp(-xi) P) at xi = 0, P the points (N, 3) moved by g (4, 4): index (K,) -> (K, 6) float32."""

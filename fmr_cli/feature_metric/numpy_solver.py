@@ -19,7 +19,7 @@ from fmr_cli.geometry.se3 import exp
 
 # Of a large source, at first a few points; then those that do better than a few in some channel; then all that may win.
 LARGE = 4096  # points
-NEAR, CLOSE = 0.02, 1e-3  # rad, and units of the normalised cloud: steps that leave most channels, or all, as they are
+NEAR, CLOSE = 0.02, 2e-3  # rad, and units of the normalised cloud: steps that leave most channels, or all, as they are
 LAST = 5  # iterations, at least, with all points that matter
 # Of a channel: points this near to winning it are evaluated too. Of 36 pairs of rooms and shapes, of 6,144 and 12,288
 # points, with 1e-3 some 17 took a third look at all points, with 3e-3 five; with more, the last iterations take longer.
