@@ -23,11 +23,13 @@ from fmr_cli.feature_metric.layers import Layers, hidden
 from fmr_cli.geometry.nearest import along_curve
 
 CHUNK = 256  # points; their activation of CHUNK x K (1 MB at 1024 channels) stays in cache
+# Points of one of ``contest``'s jobs: their last hidden activation (0.5 MB) stays in cache. Threads wait for Python's
+# lock between products: with four times as many of them, each shorter, two threads took longer than one.
 PART = 1024
 MANY = 6144  # points: of fewer, it takes less time to multiply all with all weights
 FEW = 512  # points, which are looked at first; 256 to 1,024 take the same time
-# Of ``contest``'s bound. Fewer axes, or more points a block, cost less and leave more to multiply; with 24 axes, or 8
-# points, it takes the same time (12,288 points of a room).
+# Of ``contest``'s bound. Fewer axes, or more points a block, cost less and leave more to multiply: with 16 axes it
+# takes 5 % longer, with 32, or 8 points, the same time (12,288 points of a room).
 AXES, BLOCK = 24, 16
 ROUNDING = 1e-6  # of a squared norm: what float32 leaves between two ways to compute it
 
@@ -146,7 +148,7 @@ class NumpyEncoder:
         return [*layers[:-1], (self.layers[-1][0], layers[-1][1])]
 
     def last_hidden(self, points: np.ndarray, layers: Layers) -> np.ndarray:
-        """What feeds the last layer, but for a constant: (n, 3) float32, n up to CHUNK, ``posed`` layers -> (n, width).
+        """What feeds the last layer, but for a constant: (n, 3) float32, n up to PART, ``posed`` layers -> (n, width).
 
         In this thread's own memory, good until its next call: the pages of a fresh array cost as much as the product.
         """
@@ -159,7 +161,7 @@ class NumpyEncoder:
         return x
 
     def product(self, A: np.ndarray, B: np.ndarray) -> np.ndarray:
-        """A B, of at most K x CHUNK numbers, in this thread's own memory as ``last_hidden``, which it runs after."""
+        """A B, of at most K x PART numbers, in this thread's own memory as ``last_hidden``, which it runs after."""
         shape = len(A), B.shape[1]
         return np.matmul(A, B, out=self._own.room[-1][: shape[0] * shape[1]].reshape(shape))
 
@@ -212,9 +214,8 @@ class NumpyEncoder:
             bound = self.product(most.reshape(-1, BLOCK, most.shape[1]).max(1), bounds)
             able = [bound[i : i + CHUNK // BLOCK].max(0) > above for i in range(0, len(bound), CHUNK // BLOCK)]
 
-            here = (index >= first) & (index < job[1].stop)
-            point, found = np.zeros(len(x), bool), []
-            point[index[here] - first] = True
+            channel, point, found = (index >= first) & (index < job[1].stop), np.zeros(len(x), bool), []
+            point[index[channel] - first] = True
             for start, may in zip(range(0, len(x), CHUNK), able, strict=True):
                 channels, chunk = may.nonzero()[0], slice(start, start + CHUNK)
                 values = self.product(W[channels], x[chunk].T)
@@ -222,9 +223,9 @@ class NumpyEncoder:
                 over = (top > above[channels]).nonzero()[0]
                 channels = channels[over]
                 point[chunk] |= (values[over] > above[channels, None]).any(0)
-                here[channels] = True
+                channel[channels] = True
                 found.append((channels, top[over], first + start + which[over]))
-            return Rivals(first + point.nonzero()[0], own[point], here.nonzero()[0]), found
+            return Rivals(first + point.nonzero()[0], own[point], channel.nonzero()[0]), found
 
         rivals, found = zip(*run(part, jobs(1, len(points), PART)), strict=True)
         some = (np.arange(len(b)), feature - b, index)

@@ -2,7 +2,7 @@
 
 Same equations, same answer as ``solver``. Of a large source it looks at few points only, which takes a loop of its own,
 ``solve_large``. That is what it is for: of 12,288 points and 10 of the paper's steps, the torch solver on two threads
-took 0.33 s, ``iterate`` on this encoder 0.45 s on one, ``solve_large`` 0.15 s; by ``python -m benchmarks.speed --only
+took 0.54 s, ``iterate`` on this encoder 0.40 s on one, ``solve_large`` 0.10 s; by ``python -m benchmarks.speed --only
 ic``.
 """
 
@@ -19,10 +19,11 @@ from fmr_cli.geometry.se3 import exp
 
 # Of a large source, at first a few points; then those that do better than a few in some channel; then all that may win.
 LARGE = 4096  # points
-NEAR, CLOSE = 0.02, 2e-3  # rad, and units of the normalised cloud: steps that leave most channels, or all, as they are
+NEAR, CLOSE = 0.02, 2e-3  # rad, and units of the normalised cloud: steps that leave most channels, or nearly all
 LAST = 5  # iterations, at least, with all points that matter
-# Of a channel: points this near to winning it are evaluated too. Of 36 pairs of rooms and shapes, of 6,144 and 12,288
-# points, with 1e-3 some 17 took a third look at all points, with 3e-3 five; with more, the last iterations take longer.
+# Of a channel: points this near to winning it are evaluated too. Of 32 solves of rooms and shapes, of 6,144 and 12,288
+# points, four took a third look at all points; with 2e-3 five, with 4e-3 three, but then the last iterations take
+# longer. With half of CLOSE two did, but all took a quarter of an iteration more: 4 % slower.
 MARGIN = 3e-3
 STEEPEST = 2.0  # times the steepest critical point of a target: no channel changes faster with its point (measured)
 MISSED = 1e-2  # of the mean |r|: what the channels may gain by points left out
