@@ -202,14 +202,9 @@ class Prepared:
         """Of ``fine``."""
         return self._roughness.get((count, edge), lambda: roughness(self.fine(count, edge), wide))
 
-    def for_gicp(self, count: int, edge: float, threads: int, own: bool = False) -> GicpCloud:
-        """``fine`` as small_gicp takes it; with ``own``, a sample of the cloud's own points, however many it has."""
-
-        def make() -> GicpCloud:
-            rng = np.random.default_rng(self.seed)
-            return GicpCloud(sample(self.points, count, rng) if own else self.fine(count, edge), edge, threads)
-
-        return self._gicp.get((count, edge, own), make)
+    def for_gicp(self, count: int, edge: float, threads: int) -> GicpCloud:
+        """``fine`` as small_gicp takes it."""
+        return self._gicp.get((count, edge), lambda: GicpCloud(self.fine(count, edge), edge, threads))
 
 
 def descriptors(surface: Surface, index: np.ndarray, encoder: LocalEncoder) -> np.ndarray:

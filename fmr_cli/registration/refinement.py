@@ -5,8 +5,9 @@ Poses are between the centred frames of a ``Pair``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,6 +15,7 @@ from scipy.spatial import cKDTree
 from fmr_cli.cloud import transform_points
 from fmr_cli.feature_metric.inverse_compositional import constrained_step
 from fmr_cli.feature_metric.patches import Neighbourhoods, patch_template, refine
+from fmr_cli.geometry.counterparts import counterparts, in_strips
 from fmr_cli.geometry.gicp import GicpCloud, gicp, observed
 from fmr_cli.geometry.observability import Observations
 from fmr_cli.geometry.planar import within_plane
@@ -22,8 +24,8 @@ from fmr_cli.geometry.sampling import sample
 from fmr_cli.geometry.smoothing import NEAR, Roughness, local_planes
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration.hypotheses import Hypothesis
-from fmr_cli.registration.pair import RANKING_POINTS, Pair
-from fmr_cli.registration.prepared import MIN_POINTS, SPACINGS
+from fmr_cli.registration.pair import Pair
+from fmr_cli.registration.prepared import LARGE, MIN_POINTS, SPACINGS
 
 LEVELS = ((12.0, 2.0), (6.0, 1.0))  # patch radius and grid, in voxel edges, coarse to fine; GICP does the rest
 FINE = LEVELS[1:]
@@ -40,22 +42,20 @@ ROUGH, CLEAN, SMOOTHED_OVER = 0.12, 0.08, 30
 NOISE_GROWTH = (SMOOTHED_OVER / NEAR) ** 0.5  # of the deviation from the small planes to the wide ones, at most
 SMOOTHED_REACHES = (1.0, 1.0, 0.7, 0.7, 0.5, 0.5)  # voxel edges, a step each
 GICP_REACH = 3.0  # voxel edges: source points further from the target slow its k-d tree down, by up to 500 times
-EXACT_TARGET = 200_000  # points of the target that the winner is refined against once more, each its own
-FINER = 4.0  # times the grid of the last step on large clouds, where they are dense enough
-COMMON = 0.25  # spacings, within which most points have their counterpart if the scans have points in common
+FINER = 4.0  # times as fine is the grid of the last step on large clouds, where they are dense enough
+STRIPS = 8  # across the target, in which that is looked at
+STRIP_MARGIN = 3.0  # fine voxels: as far as the neighbours reach that give a point its covariance
 
 
 @dataclass(frozen=True)
 class Polished:
-    """A pose; and, where GICP was the last to move it, the two clouds it went by, on voxels of ``edge``."""
+    """A pose; observed: what it was found by, where that is known better than by the voxels.
+
+    Of other steps than GICP the voxels say it: smoothing takes the noise out of the residuals too.
+    """
 
     T_target_source: np.ndarray
-    clouds: tuple[GicpCloud, GicpCloud] | None = None
-    edge: float = 0.0
-
-    def observed(self) -> Observations | None:
-        """What GICP went by. Of other steps the voxels say it: smoothing takes the noise out of the residuals too."""
-        return None if self.clouds is None else observed(*self.clouds, self.T_target_source, self.edge)
+    observed: Callable[[], Observations | None] = lambda: None
 
 
 def roughly(pair: Pair, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -170,8 +170,11 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> Polished:
     s, t = pair.both(lambda cloud, count: cloud.fine(count, edge), (GICP_SOURCE, GICP_TARGET))
     if pair.options.scale or pair.motion.dof != "rigid":
         return Polished(constrained(s, t, T_target_source, edge, pair.motion.basis(), pair.options.scale))
+    rough = noisy(pair)
+    if not rough and (fine := finer_edge(pair)):
+        return on_finer_voxels(pair, T_target_source, fine)
     found = gicp_in_reach(pair, s, pair.target.for_gicp(GICP_TARGET, edge, pair.threads), T_target_source)
-    if noisy(pair):
+    if rough:
         T = found.T_target_source
         any_motion = np.eye(6)
         clean_source, clean_target = (cloud.share < CLEAN for cloud in roughnesses(pair))
@@ -184,6 +187,26 @@ def by_geometry(pair: Pair, T_target_source: np.ndarray) -> Polished:
         found = Polished(T)
     planes = pair.flat_planes
     return found if planes is None else Polished(within_plane(found.T_target_source, *planes))
+
+
+def finer_edge(pair: Pair) -> float | None:
+    """The voxel edge of the finer grid that two large scans are dense enough for, if they are."""
+    source, target = pair.source, pair.target
+    fine = max(pair.edge / FINER, SPACINGS * source.spacing, SPACINGS * target.spacing)
+    large = min(len(source.points), len(target.points)) > LARGE
+    return fine if large and fine <= pair.edge / 2 else None
+
+
+def on_finer_voxels(pair: Pair, T_target_source: np.ndarray, fine: float) -> Polished:
+    """The pose after GICP on voxels of edge ``fine``, each the mean of many points, in strips of the scans.
+
+    As many voxels from anywhere would be as exact, but would need all of the target's to be looked at.
+    """
+    s, t = pair.both(lambda cloud: cloud.thinned(fine))
+    period, margin = 2 * pair.target.reach / STRIPS, STRIP_MARGIN * fine
+    share = GICP_SOURCE / max(len(s), GICP_SOURCE) + 2 * margin / period
+    s, t = in_strips(s, t, T_target_source, period, share, margin)
+    return by_gicp(GicpCloud(s, fine, pair.threads), GicpCloud(t, fine, pair.threads), T_target_source, fine)
 
 
 def noisy(pair: Pair) -> bool:
@@ -232,35 +255,17 @@ def gicp_in_reach(pair: Pair, source: np.ndarray, target: GicpCloud, T_target_so
 
 def by_gicp(source: GicpCloud, target: GicpCloud, T_target_source: np.ndarray, edge: float) -> Polished:
     """The pose after GICP between two clouds on voxels of ``edge``."""
-    return Polished(gicp(source, target, T_target_source, edge), (source, target), edge)
+    T = gicp(source, target, T_target_source, edge)
+    return Polished(T, partial(observed, source, target, T, edge))
 
 
 def exact(pair: Pair, polished: Polished) -> Polished:
-    """The pose after GICP on more than the step before saw, where there is more.
-
-    Scans that have points in common come to coincide, point by point; otherwise a grid is the better mean, of large
-    scans a finer one.
-    """
-    source, target, T = pair.source, pair.target, polished.T_target_source
+    """The pose by the points that large scans have in common, if most have: these come to coincide, point by point."""
+    source, target = pair.source, pair.target
     other_motion = pair.options.scale or pair.motion.dof != "rigid"
     if other_motion or len(target.points) <= GICP_TARGET or pair.flat_planes is not None or noisy(pair):
-        return polished  # what the step before did for these, GICP would undo
-    if len(target.points) <= 4 * EXACT_TARGET and in_common(pair, T):
-        some = sample(source.points, GICP_SOURCE, np.random.default_rng(pair.seed))
-        return gicp_in_reach(pair, some, target.for_gicp(EXACT_TARGET, pair.edge, pair.threads, own=True), T)
-    fine = max(pair.edge / FINER, SPACINGS * source.spacing, SPACINGS * target.spacing)
-    if min(len(source.points), len(target.points)) < EXACT_TARGET or fine > pair.edge / 2:
-        return polished
-    s, t = pair.both(lambda cloud: cloud.thinned(fine))
-    some = sample(s, GICP_SOURCE, np.random.default_rng(pair.seed))
-    return by_gicp(GicpCloud(some, fine, pair.threads), GicpCloud(t, fine, pair.threads), T, fine)
-
-
-def in_common(pair: Pair, T_target_source: np.ndarray) -> bool:
-    """Whether most of a few points of the source have their like in the target."""
-    some = transform_points(
-        T_target_source, sample(pair.source.points, RANKING_POINTS, np.random.default_rng(pair.seed))
+        return polished  # what the step before did for these, this would undo
+    common = counterparts(
+        source.points, target.points, polished.T_target_source, target.spacing, target.reach, pair.seed
     )
-    tree = cKDTree(pair.target.points, balanced_tree=False, compact_nodes=False)
-    distance = tree.query(some, distance_upper_bound=pair.edge)[0]
-    return bool(np.median(distance) <= COMMON * pair.target.spacing)
+    return Polished(common.T_target_source, common.observed) if common else polished

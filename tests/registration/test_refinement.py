@@ -7,10 +7,13 @@ import pytest
 
 from fmr_cli import PointCloud
 from fmr_cli.cloud import angle_degrees
+from fmr_cli.geometry.gicp import GicpCloud
 from fmr_cli.geometry.observability import certainty
+from fmr_cli.geometry.pose_error import pose_error
 from fmr_cli.geometry.se3 import log
 from fmr_cli.registration import Options, prepare, refinement
 from fmr_cli.registration.pair import Pair, make_pair
+from fmr_cli.synthetic import scenes
 from fmr_cli.synthetic.near_pairs import Degraded, near_pair, two_sensors
 from fmr_cli.synthetic.shapes import shapes
 
@@ -80,3 +83,41 @@ def test_other_steps_than_gicp_leave_the_covariance_to_the_voxels() -> None:
     assert refinement.by_geometry(pair, start).observed() is None
     held = make_pair(pair.source, pair.target, Options(dof="yaw"))
     assert refinement.by_geometry(held, start).observed() is None
+
+
+@pytest.fixture(scope="module")
+def room() -> np.ndarray:
+    """Views of a room by a depth camera, metres."""
+    rng = np.random.default_rng(900)
+    room = scenes.room(rng)
+    views = [scenes.room_scan(room, rng, np.array([0.1 * k, 0.0, 1.4]), 0.7 * k) for k in range(9)]
+    return rng.permutation(np.concatenate(views))
+
+
+def test_strips_of_fine_voxels_are_as_exact_as_all_of_them(room: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refinement, "LARGE", 50_000)
+    off = []
+    for number in range(5):
+        halves = np.random.default_rng(number).permutation(room)[:200_000].reshape(2, -1, 3)
+        pair = make_pair(*(prepare(PointCloud(points)) for points in halves), Options())
+        true = pair.enter_centred(np.eye(4))
+        fine = refinement.finer_edge(pair)
+        assert fine is not None
+        strips = refinement.by_geometry(pair, refinement.by_planes(pair, true)).T_target_source
+        s, t = (GicpCloud(cloud.thinned(fine), fine) for cloud in (pair.source, pair.target))
+        everywhere = refinement.by_gicp(s, t, strips, fine).T_target_source
+        off.append([pose_error(T, true)[1] for T in (strips, everywhere)])
+    ours, plain = np.median(off, axis=0)
+    assert ours < 2 * plain  # of a quarter of the points or less
+    assert ours < 0.02 * pair.edge
+
+
+def test_copies_that_gicp_leaves_apart_come_to_coincide(room: np.ndarray) -> None:
+    points = room[:60_000]
+    pair = make_pair(*(prepare(PointCloud(points)) for _ in "ab"), Options())
+    near = refinement.by_geometry(pair, refinement.by_planes(pair, np.eye(4)))
+    polished = refinement.exact(pair, near)
+    assert np.abs(near.T_target_source - np.eye(4)).max() > 1e-8
+    assert np.abs(polished.T_target_source - np.eye(4)).max() < 1e-12
+    covariance = certainty(pair.s, pair.t, polished.T_target_source, np.zeros(3), polish=polished.observed()).covariance
+    assert 0 < np.linalg.eigvalsh(covariance).min() <= np.linalg.eigvalsh(covariance).max() < (1e-4 * pair.edge) ** 2
