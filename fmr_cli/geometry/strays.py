@@ -88,6 +88,8 @@ def on_a_shell(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         if near.sum() < len(outer) / 3:
             continue
         centre, radius = fitted_sphere(outer[near])
+        if length(some - centre).max() >= (1 + 2 * SHELL) * radius:
+            continue  # as of most clouds, by the few points: others lie outside
         distance = length(points - centre) / radius
         shell = np.abs(distance - 1) < SHELL
         if not SHELL_SHARE * len(points) <= shell.sum() <= len(points) * (1 - 1 / 20):

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# Voxels of the box for each point, up to which a table of them all is made: to look a point up there takes a third of
+# the time of sorting it, or as long at twice as many.
+DENSE = 8
 BITS = 21  # of a voxel's index along an axis: three times 21 fit an int64
 
 
@@ -70,8 +73,16 @@ def voxel_ranks(points: np.ndarray, edge: float) -> np.ndarray:
     key, cells = numbers_in_box(indices, len(points))
     if cells >= 1 << min(53, 63 - bits):  # a box of so many voxels is empty but for a few
         return np.unique(np.floor(points[:, ::-1] * (1 / edge)), axis=0, return_inverse=True)[1].reshape(-1)
+    key = key.astype(np.int64)
+    if cells <= DENSE * len(points):
+        occupied = np.zeros(cells, bool)
+        occupied[key] = True
+        found = np.flatnonzero(occupied)
+        rank_of = np.empty(cells, np.int64)
+        rank_of[found] = np.arange(len(found))
+        return rank_of[key]
     # Each point's own number in the last bits: to sort such numbers takes a fifth of the time of sorting by a key
-    packed = key.astype(np.int64) << bits | np.arange(len(points))
+    packed = key << bits | np.arange(len(points))
     packed.sort()
     voxel = packed >> bits
     rank = np.empty(len(points), np.int64)
