@@ -108,7 +108,8 @@ class Rivals:
 class NumpyEncoder:
     """F for one cloud on the CPU.
 
-    threads: how many of Python's to spread the work over; it changes no bit of a result. BLAS is best kept to one.
+    threads: how many of Python's to spread the work on MANY points over; it changes no bit of a result, and on fewer
+    costs more than it saves. BLAS is best kept to one.
     """
 
     def __init__(self, layers: Layers) -> None:
@@ -125,11 +126,10 @@ class NumpyEncoder:
     def encode(self, points: np.ndarray, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """F and the critical points: (N, 3) -> feature (K,), index (K,) of the point that set each channel."""
         points = points.astype(np.float32)
+        if len(points) < MANY:
+            return tuple(x[0] for x in self.peaks(points, [self._unmoved], map))
+        order = along_curve(points)
         with spread(threads) as run:
-            if len(points) < MANY:
-                return tuple(x[0] for x in self.peaks(points, [self._unmoved], run))
-
-            order = along_curve(points)
             feature, index, _ = self.whole(points[order], self._unmoved, run)
         return feature, order[index]
 

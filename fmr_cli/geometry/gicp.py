@@ -11,8 +11,8 @@ from fmr_cli.geometry.observability import Observations
 COVARIANCE_NEIGHBOURS = 10  # points: small_gicp's own default
 REACH = 1.0  # voxel edges: partners further apart are none, in the end
 THIN = 1e-3  # of a point's covariance along its normal, that along the surface being 1: small_gicp's own
-# Points, fewer of which one thread prepares in some milliseconds; a second one that waits for more spins for ten.
-MANY = 10_000
+# Points, fewer of which one thread prepares in twenty milliseconds; a second one that waits for more spins for ten.
+MANY = 20_000
 
 
 class GicpCloud:

@@ -24,7 +24,7 @@ def distinct(points: np.ndarray) -> np.ndarray:
     x, y, z = points.T
     along = x * OBLIQUE[0] + y * OBLIQUE[1] + z * OBLIQUE[2]  # term by term: equal points to equal bits
     ordered = np.sort(along)
-    met = ordered[1:][np.diff(ordered) == 0]
+    met = ordered[1:][ordered[1:] == ordered[:-1]]
     if not len(met):
         return points
     some = np.flatnonzero(met[np.searchsorted(met, along).clip(max=len(met) - 1)] == along)
