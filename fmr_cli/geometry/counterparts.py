@@ -82,5 +82,5 @@ def in_strips(
         place = points @ (direction / period)
         place += shift / period
         place -= np.rint(place)
-        found.append(points[np.abs(place, out=place) <= half])
+        found.append(points[np.flatnonzero(np.abs(place, out=place) <= half)])
     return found[0], found[1]
