@@ -46,13 +46,15 @@ class Judged:
     """What one look at a pair found. x: (n, 11), ``Evidence.vector`` of each pose; right: (n,) bool.
 
     largest: (n,), ``Agreement.largest`` of each; place: (n,), a number for each pose, one for what several looks found;
-    look: which one, see ``looks``; kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
+    told: (n,) bool, the one that a thing tells from its rivals, if any, see ``distinction``; look: which one, see
+    ``looks``; kind, unique: of the pair, see ``verdict_pairs``; number: which pair.
     """
 
     x: np.ndarray
     right: np.ndarray
     largest: np.ndarray
     place: np.ndarray
+    told: np.ndarray
     look: Look
     kind: str
     unique: bool
@@ -86,7 +88,10 @@ def pair_evidence(seed: tuple[int, int]) -> list[Judged]:
                 if len(x):
                     largest = np.array([c.evidence.largest for c in judge.candidates])
                     place = np.array([number_of(c.T_target_source, places, judge.pair) for c in judge.candidates])
-                    found.append(Judged(x, np.array(right), largest, place, look, pair.kind, pair.unique, seed[1]))
+                    told = judge.told & (np.arange(len(x)) == 0)
+                    found.append(
+                        Judged(x, np.array(right), largest, place, told, look, pair.kind, pair.unique, seed[1])
+                    )
     except RegistrationError:  # a street and a teacup: nothing to judge
         return []
     return found

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fmr_cli.evaluation.verdict_evidence import Judged
-from fmr_cli.registration.confidence import MISSING, QUALITY, confidences, products, sigmoid, standing
+from fmr_cli.registration.confidence import MISSING, QUALITY, confidences, products, sigmoid, standing, told
 from fmr_cli.registration.verdict_weights import Weights
 
 RIDGE = 2e-3  # on the standardised weights of support and fit: next to nothing where the evidence decides
@@ -81,7 +81,8 @@ def judge(evidence: Sequence[Judged], weights: Weights) -> tuple[np.ndarray, np.
     for j in evidence:
         shares, weigh = confidences(j.x, j.largest, weights)
         best = int(weigh.argmax())
-        said.append((shares[best], best))
+        p = float(shares[best])
+        said.append((told(p, j.x[best]) if j.told[best] else p, best))
     confidence, which = zip(*said, strict=True)
     return np.array(confidence), np.array(which)
 

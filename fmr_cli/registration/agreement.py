@@ -94,7 +94,7 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
     for way in [] if denied else seen:
         x, judged = way.points, way.explained | way.contradicted
         missing += amid_their_like(x[judged], way.contradicted[judged], LIKE_REACH * target.edge)
-        largest += largest_cluster(x[way.contradicted], ONE_THING * target.edge)
+        largest += int(in_one_thing(x[way.contradicted], target.edge).sum())
         on = way.explained
         detail += on.sum() * share_beyond_corner(x[on], way.normals[on], target.edge, np.random.default_rng(0))
     off2, own_off2, turns, own_turns = sums[3:] / max(sums[2], 1.0)
@@ -117,13 +117,16 @@ def agreement(source: Surface, target: Surface, T_target_source: np.ndarray) -> 
 class Way:
     """What one surface says of the other one.
 
-    asked: its points. sums (7,): how many are explained, contradicted, touching; of those that touch, the squares of
-    their offsets and of the surface's own, 1 - |cosine| and the surface's own. Of its points that are near, (N,):
-    where they are in the other's frame (N, 3), the normals there (N, 3), which are explained and which contradicted.
+    size: its points; asked: those of them that are asked. sums (7,): how many are explained, contradicted, touching; of
+    those that touch, the squares of their offsets and of the surface's own, 1 - |cosine| and the surface's own. Of its
+    points that are near, (N,): index, which they are; where they are in the other's frame (N, 3), the normals there
+    (N, 3), which are explained and which contradicted.
     """
 
+    size: int
     asked: int
     sums: np.ndarray
+    index: np.ndarray
     points: np.ndarray
     normals: np.ndarray
     explained: np.ndarray
@@ -154,7 +157,8 @@ def both_ways(source: Surface, target: Surface, T_target_source: np.ndarray, eve
             explained.sum(), contradicted.sum(), touching.sum(), (off[touching] ** 2).sum(),
             (own_off[touching] ** 2).sum(), (1 - cosine[touching]).sum(), own_turn[touching].sum(),
         ]  # fmt: skip
-        found.append(Way(max(int(solid.sum()), 1), np.array(sums), moved[here], n, explained, contradicted))
+        asked = max(int(solid.sum()), 1)
+        found.append(Way(len(a.points), asked, np.array(sums), own, moved[here], n, explained, contradicted))
     return found
 
 
@@ -166,13 +170,14 @@ def amid_their_like(points: np.ndarray, some: np.ndarray, reach: float) -> int:
     return int((np.append(some, False)[index].sum(1) >= MOSTLY).sum())  # index N: nothing so near
 
 
-def largest_cluster(points: np.ndarray, reach: float) -> int:
-    """How many of points (N, 3) the largest cluster has: each within ``reach`` of another one of it."""
+def in_one_thing(points: np.ndarray, edge: float) -> np.ndarray:
+    """(N,) bool: which of points (N, 3) are of the largest cluster, each within ONE_THING edges of another of it."""
     if not len(points):
-        return 0
-    near = cKDTree(points).query_pairs(reach, output_type="ndarray")
+        return np.zeros(0, bool)
+    near = cKDTree(points).query_pairs(ONE_THING * edge, output_type="ndarray")
     links = coo_matrix((np.ones(len(near), bool), near.T), shape=(len(points), len(points)))
-    return int(np.bincount(connected_components(links, directed=False)[1]).max())
+    cluster = connected_components(links, directed=False)[1]
+    return cluster == np.bincount(cluster).argmax()
 
 
 def stretch(source: Surface, target: Surface, T_target_source: np.ndarray) -> float:

@@ -12,7 +12,8 @@ import numpy as np
 
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration import hypotheses, refinement
-from fmr_cli.registration.confidence import LIKELY, Judge, in_words, pooled
+from fmr_cli.registration.confidence import LIKELY, Judge, in_words, pooled, told
+from fmr_cli.registration.distinction import stands_out
 from fmr_cli.registration.hypotheses import Hypothesis
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -101,22 +102,14 @@ def same_best(coarse: Judge, fine: Judge) -> bool:
 
 
 def together(close: Judge, fine: Judge) -> Judge:
-    """The fine look, with what both looks say of its best pose; the other poses share what is left, as before.
+    """The fine look, with what both looks say of its best pose.
 
     Fine voxels see more, and yet of poses that they were less sure of than close ones, more were right than they say:
     of 1,400 made-up pairs, each judged by weights that were fitted on others, 10 more were ``aligned``, and none of
     these wrong.
     """
-    best, *others = fine.candidates
-    confidence = pooled([close.best.confidence, best.confidence])
-    left = (1 - confidence) / (1 - best.confidence)
-    return replace(
-        fine,
-        candidates=[
-            replace(best, confidence=confidence),
-            *(replace(c, confidence=left * c.confidence) for c in others),
-        ],
-    )
+    fine.believe(pooled([close.best.confidence, fine.best.confidence]))
+    return fine
 
 
 def disputed(coarse: Judge, fine: Judge) -> Judge:
@@ -142,6 +135,7 @@ def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None, known:
     judge, found = Judge(pair), features(pair, time)
     look_again(judge, former, time)
     consider(judge, found, time, known)
+    tell_apart(judge, time)
     return judge
 
 
@@ -182,6 +176,7 @@ def further(
         consider(judge, found, time)
     if not judge.candidates:  # every pose found lies beyond the options' max_angle or max_shift
         judge.consider(pair.enter_centred(np.eye(4)), "identity", [])
+    tell_apart(judge, time)
     return judge
 
 
@@ -229,6 +224,15 @@ def consider(judge: Judge, found: list[Hypothesis], time: Stopwatch, known: floa
             rivals, repeats = hypotheses.rivals(pair, judge.best.T_target_source)
             judge.found_repeats(repeats)
             judge_refined(judge, rivals)  # as they are: rough steps might take them back to the pose itself
+
+
+def tell_apart(judge: Judge, time: Stopwatch) -> None:
+    """Believe more in a pose that is not sure for its rivals, where one thing tells it from them."""
+    if likely(judge) and not judge.sure(SURE):
+        with time.stage("rivals"):
+            judge.told = stands_out(judge)
+            if judge.told:
+                judge.believe(told(judge.best.confidence, judge.best.evidence.vector()))
 
 
 def judge_refined(judge: Judge, found: list[Hypothesis]) -> None:

@@ -11,7 +11,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.evaluation.verdict import calibration_error
 from fmr_cli.evaluation.verdict_evidence import Judged, all_looks, decisive, number_of, pair_evidence
 from fmr_cli.evaluation.verdict_fit import are_right, cross_validated, fit, judge
-from fmr_cli.registration.confidence import ALIGNED, DETAIL, MISSING, QUALITY, SHARE, STRETCH
+from fmr_cli.registration.confidence import ALIGNED, DETAIL, MISSING, QUALITY, SHARE, STRETCH, TOLD, most
 from fmr_cli.registration.looks import CLOSER, DISPUTED, FINE, FIRST, SURE, WIDER, at_once
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pipeline import one_blas_thread
@@ -34,7 +34,7 @@ def drawn() -> list[Judged]:
         x[:, bounding] = np.abs(x[:, bounding])  # nothing that bounds a confidence by itself
         right = np.zeros(3, bool)
         right[0] = rng.random() < 1 / (1 + np.exp(-2 * x[0, 1]))
-        looks.append(Judged(x, right, np.zeros(3), np.arange(3), FIRST, "drawn", True, number))
+        looks.append(Judged(x, right, np.zeros(3), np.arange(3), np.zeros(3, bool), FIRST, "drawn", True, number))
     return looks
 
 
@@ -57,6 +57,15 @@ def test_what_is_missing_tells_among_rivals_alone(drawn):
     weights = fit(told)
     assert weights.support[MISSING] == 0
     assert weights.fit[MISSING - QUALITY.start] > 0
+
+
+def test_a_pose_that_a_thing_tells_from_its_rivals_is_believed_more(drawn):
+    weights = fit(drawn)
+    plain, best = judge(drawn, weights)
+    raised, same = judge([replace(j, told=np.arange(3) == i) for j, i in zip(drawn, best, strict=True)], weights)
+    assert (best == same).all()
+    bound = [most(j.x[i]) for j, i in zip(drawn, best, strict=True)]
+    assert raised == pytest.approx(np.minimum(TOLD * plain / (1 - plain + TOLD * plain), bound))
 
 
 def test_the_table_counts_every_pair_and_its_right_ones():

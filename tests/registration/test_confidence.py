@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from fmr_cli.cloud import PointCloud, angle_degrees, transform_points
 from fmr_cli.geometry.surface import Surface
 from fmr_cli.registration import confidence
-from fmr_cli.registration.agreement import agreement, amid_their_like, largest_cluster
+from fmr_cli.registration.agreement import agreement, amid_their_like, in_one_thing
 from fmr_cli.registration.pipeline import align
 from fmr_cli.registration.verdict_weights import bundled_weights
 
@@ -147,9 +147,9 @@ def test_a_small_thing_is_one_cluster_and_edges_are_many() -> None:
     grid = np.array([[x, y, 0.0] for x in range(60) for y in range(60)])
     door = (np.abs(grid[:, 0] - 30) < 2) & (np.abs(grid[:, 1] - 20) < 4)
     scattered = np.random.default_rng(0).permutation(door)
-    assert largest_cluster(grid[door], 1.5) == door.sum()
-    assert largest_cluster(grid[scattered], 1.5) <= confidence.BY_CHANCE
-    assert largest_cluster(grid[:0], 1.5) == 0
+    assert in_one_thing(grid[door], 1.0).all()
+    assert in_one_thing(grid[scattered], 1.0).sum() <= confidence.BY_CHANCE
+    assert in_one_thing(grid[:0], 1.0).shape == (0,)
 
 
 def test_poses_that_fit_as_well_are_not_sure() -> None:
