@@ -28,6 +28,7 @@ from fmr_cli.registration.looks import (
     further,
     surest,
     taken_up,
+    tell_apart,
 )
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
@@ -113,6 +114,8 @@ def all_looks(source: Prepared, target: Prepared) -> dict[Look, Judge]:
         with suppress(RegistrationError):  # too few voxels of that size
             pair = make_pair(source, target, Options(), 1, *look)
             judges[look] = coarse_look(pair, time, taken_up(look, judges))
+            if look != WIDER:
+                tell_apart(judges[look], time)
     return judges | {FINE: further(source, target, Options(), 1, time, surest(judges.values()))}
 
 

@@ -69,6 +69,8 @@ def at_once(
         with suppress(RegistrationError):  # too few voxels of that size
             pair = make_pair(source, target, options, threads, *look)
             judges[look] = coarse_look(pair, time, taken_up(look, judges))
+            if look != WIDER:  # on which things stand out that are none
+                tell_apart(judges[look], time)
             if judges[look].sure(COARSE[look]):
                 return finer(judges[look])
     coarse = surest(judges.values())
@@ -135,7 +137,6 @@ def coarse_look(pair: Pair, time: Stopwatch, former: Judge | None = None, known:
     judge, found = Judge(pair), features(pair, time)
     look_again(judge, former, time)
     consider(judge, found, time, known)
-    tell_apart(judge, time)
     return judge
 
 
