@@ -107,8 +107,8 @@ def together(close: Judge, fine: Judge) -> Judge:
     """The fine look, with what both looks say of its best pose.
 
     Fine voxels see more, and yet of poses that they were less sure of than close ones, more were right than they say:
-    of 1,400 made-up pairs, each judged by weights that were fitted on others, 10 more were ``aligned``, and none of
-    these wrong.
+    of 1,400 made-up pairs, each judged by weights that were fitted on others, 749 were ``aligned`` in place of 740, 22
+    in place of 20 of them wrongly, and the calibration error was 0.019 in place of 0.026.
     """
     fine.believe(pooled([close.best.confidence, fine.best.confidence]))
     return fine
