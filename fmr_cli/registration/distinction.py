@@ -15,7 +15,7 @@ from fmr_cli.registration.confidence import RIVAL_SUPPORT, Candidate, Judge
 from fmr_cli.registration.pair import Pair
 
 THING = 10  # points of both scans: fewer are what two views see differently of an edge
-CLEAR = 4.0  # times the largest thing that contradicts the best pose itself, that this one has at least
+FAR_LARGER = 4.0  # times the largest thing that contradicts the best pose itself, that this one has at least
 # A pose is one of the like, wrong by nothing but a thing, if it explains that share of what the best one explains, and
 # of what contradicts it that share lies in the thing, which has no more points than that share of what it explains.
 LIKE, ONE, SMALL = 0.3, 0.3, 0.1
@@ -40,7 +40,9 @@ def stands_out(judge: Judge) -> bool:
         return max((int((seen & points).sum()) for c, points in things if c is not candidate), default=0)
 
     own = explained(best) if things else 0
-    return own >= max(THING, CLEAR * best.evidence.largest) and all(own >= TIMES * (explained(c) + 1) for c in close)
+    return own >= max(THING, FAR_LARGER * best.evidence.largest) and all(
+        own >= TIMES * (explained(c) + 1) for c in close
+    )
 
 
 def is_alike(candidate: Candidate, best: Candidate) -> bool:
