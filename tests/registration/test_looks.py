@@ -48,6 +48,27 @@ def test_a_pose_that_fine_voxels_do_not_bear_out_is_given_with_a_doubt(
     assert doubts(judge.pair, judge.best, [])[0].startswith(f"on finer voxels {reason}")
 
 
+def test_two_looks_at_one_pose_are_one_opinion_and_leave_the_others_less(scans: tuple[Prepared, Prepared]) -> None:
+    close, fine = looked(scans, looks.CLOSER, 0.9), looked(scans, looks.FINE, 0.5)
+    assert looks.same_best(close, fine)
+    assert not looks.same_best(close, looked(scans, looks.FINE, 0.5, shift=1.0))
+    fine.candidates.append(replace(fine.best, confidence=0.4))
+    both = looks.together(close, fine)
+    assert both.pair is fine.pair
+    assert [c.confidence for c in both.candidates] == pytest.approx([0.75, 0.2])  # odds of 9 and 1: of 3
+
+
+@pytest.mark.parametrize(("stands_out", "confidence"), [(True, 0.9), (False, 0.4737)])
+def test_a_thing_that_tells_a_pose_from_its_rivals_makes_its_odds_ten_times_as_good(
+    scans: tuple[Prepared, Prepared], stands_out: bool, confidence: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(looks, "stands_out", lambda judge: stands_out)
+    judge = looked(scans, looks.CLOSER, 0.4737)  # odds of 0.9
+    looks.tell_apart(judge, Stopwatch())
+    assert judge.told == stands_out
+    assert judge.best.confidence == pytest.approx(confidence, abs=1e-3)
+
+
 def test_a_wide_look_is_refined_on_finer_voxels_and_others_on_their_own(scans: tuple[Prepared, Prepared]) -> None:
     closer = looked(scans, looks.CLOSER, 0.9)
     assert looks.finer(closer) is closer
