@@ -2,7 +2,7 @@
 
 Same equations, same answer as ``solver``. Of a large source it looks at few points only, which takes a loop of its own,
 ``solve_large``. That is what it is for: of 12,288 points and 10 of the paper's steps, the torch solver on two threads
-took 0.54 s, ``iterate`` on this encoder 0.40 s on one, ``solve_large`` 0.10 s; by ``python -m benchmarks.speed --only
+took 0.26 s, ``iterate`` on this encoder 0.41 s on one, ``solve_large`` 0.11 s; by ``python -m benchmarks.speed --only
 ic``.
 """
 
