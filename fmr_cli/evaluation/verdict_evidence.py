@@ -17,19 +17,7 @@ from fmr_cli.cloud import PointCloud
 from fmr_cli.cores import usable_cores
 from fmr_cli.errors import RegistrationError
 from fmr_cli.registration.confidence import Judge, pooled
-from fmr_cli.registration.looks import (
-    COARSE,
-    DISPUTED,
-    FINE,
-    HOPELESS,
-    WIDER,
-    Look,
-    coarse_look,
-    further,
-    surest,
-    taken_up,
-    tell_apart,
-)
+from fmr_cli.registration.looks import COARSE, DISPUTED, FINE, HOPELESS, WIDER, Look, further, next_look, surest
 from fmr_cli.registration.options import Options
 from fmr_cli.registration.pair import Pair, make_pair
 from fmr_cli.registration.pipeline import one_blas_thread
@@ -112,10 +100,7 @@ def all_looks(source: Prepared, target: Prepared) -> dict[Look, Judge]:
     time, judges = Stopwatch(), dict[Look, Judge]()
     for look in COARSE:
         with suppress(RegistrationError):  # too few voxels of that size
-            pair = make_pair(source, target, Options(), 1, *look)
-            judges[look] = coarse_look(pair, time, taken_up(look, judges))
-            if look != WIDER:
-                tell_apart(judges[look], time)
+            judges[look] = next_look(look, make_pair(source, target, Options(), 1, *look), time, judges)
     return judges | {FINE: further(source, target, Options(), 1, time, surest(judges.values()))}
 
 
